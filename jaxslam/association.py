@@ -1,0 +1,44 @@
+"""Which feature is which landmark: gates on distances; knows no filter."""
+
+import jax.numpy as jnp
+
+from jaxslam.types import Array
+
+
+def match(distance: Array, possible: Array, *, gate: float, margin: float) -> Array:
+    """Match features to landmarks one to one.
+
+    A pair is believed when it lies in the gate, each is the nearest to the other, and the
+    runner-up of the feature is clearly further; what is ambiguous stays unmatched.
+
+    Args:
+        distance: (M, L) squared Mahalanobis distances.
+        possible: (M, L) bool, pairs that may be matched at all.
+        gate: Largest squared distance of a match.
+        margin: How much further, in squared distance, the second nearest landmark must be.
+
+    Returns:
+        (M,) int32 landmark of each feature, L for none.
+    """
+    m, l = distance.shape
+    d = jnp.where(possible & jnp.isfinite(distance), distance, jnp.inf)
+    best = jnp.argmin(d, axis=1)
+    nearest = jnp.take_along_axis(d, best[:, None], axis=1)[:, 0]
+    others = jnp.where(jnp.arange(l) == best[:, None], jnp.inf, d)
+    clear = jnp.min(others, axis=1) > nearest + margin
+    mutual = jnp.argmin(d, axis=0)[best] == jnp.arange(m)
+    return jnp.where((nearest < gate) & clear & mutual, best, l).astype(jnp.int32)
+
+
+def claim_slots(free: Array, wanted: Array) -> Array:
+    """Slot (M,) int32 for each feature that wants one, in order; L, nowhere, for all others.
+
+    Args:
+        free: (L,) bool, slots that may be taken.
+        wanted: (M,) bool.
+    """
+    free_first = jnp.argsort(~free, stable=True)
+    rank = jnp.cumsum(wanted) - 1
+    fits = wanted & (rank < jnp.sum(free))
+    slot = free_first[jnp.clip(rank, 0, free.size - 1)]
+    return jnp.where(fits, slot, free.size).astype(jnp.int32)

@@ -1,0 +1,97 @@
+"""Lines and numbers of text files, plain or gzipped; their errors say where."""
+
+import gzip
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+
+from jaxslam.io.errors import InputError
+
+
+def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
+    """Yield each line of a text file with its number, counted from 1.
+
+    Args:
+        path: Text file; a gzipped one is unpacked on the way.
+
+    Raises:
+        InputError: The file is missing, a folder, unreadable, empty, binary or a damaged gzip.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError("is a folder", path=path, advice="name a file inside it")
+    try:
+        with open(path, "rb") as file:
+            packed = file.read(2) == b"\x1f\x8b"
+        with gzip.open(path, "rb") if packed else open(path, "rb") as file:
+            head = file.read(4096)
+            if not head.strip():
+                raise InputError("is empty", path=path, advice="name a file with content")
+            if b"\0" in head:
+                raise InputError("is binary", path=path, advice="name a text file")
+            file.seek(0)
+            for number, line in enumerate(file, start=1):
+                yield number, line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
+    except FileNotFoundError:
+        raise InputError("does not exist", path=path, advice="check the name") from None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise InputError(
+            f"is a damaged gzip file ({error})", path=path, advice="copy it again"
+        ) from None
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", path=path, advice="check its permissions"
+        ) from None
+
+
+def number(field: bytes, name: str) -> float:
+    """Value of one field.
+
+    Args:
+        field: Text of the field.
+        name: How the error calls it.
+
+    Raises:
+        InputError: The text is no number, or NaN or infinite; without the place.
+    """
+    try:
+        value = float(field)
+    except ValueError:
+        shown = field[:20].decode("utf-8", "replace")
+        raise InputError(f"{shown!r} is not a number", field=name) from None
+    if not math.isfinite(value):
+        raise InputError(f"{value} is not finite", field=name)
+    return value
+
+
+def rows(path: str | PathLike, names: Sequence[str], form: str) -> list[tuple[int, list[float]]]:
+    """Read a table: a line number and the finite numbers of each line that is no comment.
+
+    Args:
+        path: Text file; `#` starts a comment line.
+        names: What the fields are called, in order.
+        form: What such a file is called, for the errors.
+
+    Raises:
+        InputError: As `lines`; a line has too few or too many fields, or one is no finite
+            number; there is no line but comments.
+    """
+    table = []
+    for line, text in lines(path):
+        fields = text.split()
+        if not fields or fields[0].startswith(b"#"):
+            continue
+        advice = f"a line of {form} is: {' '.join(names)}"
+        if len(fields) != len(names):
+            problem = f"{len(fields)} fields instead of {len(names)}"
+            raise InputError(problem, path=path, line=line, advice=advice)
+        try:
+            values = [number(field, name) for field, name in zip(fields, names, strict=True)]
+        except InputError as error:
+            raise InputError(str(error), path=path, line=line, advice=advice) from None
+        table.append((line, values))
+    if not table:
+        raise InputError("holds only comments", path=path, advice=f"name a file of {form}")
+    return table

@@ -1,0 +1,61 @@
+"""Trajectories in the TUM format, `t x y z qx qy qz qw` a line, as evo and others read it."""
+
+import math
+from os import PathLike
+
+import numpy as np
+
+from jaxslam.io.errors import InputError
+from jaxslam.io.output import write_text
+from jaxslam.io.text import rows
+
+FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def read(path: str | PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) [s] and poses (N, 3) [m, m, rad] of a trajectory, seen from above.
+
+    Args:
+        path: Text file; height, roll and pitch are dropped.
+
+    Raises:
+        InputError: The file cannot be read, or a line is not eight finite numbers of which the
+            last four are a unit quaternion.
+    """
+    table = rows(path, FIELDS, "a TUM trajectory")
+    for line, values in table:
+        norm = math.hypot(*values[4:])
+        if abs(norm - 1.0) > 1e-2:
+            problem = f"quaternion of length {norm:.3g} instead of 1"
+            advice = "the last four fields are qx qy qz qw"
+            raise InputError(problem, path=path, line=line, field="qx qy qz qw", advice=advice)
+    values = np.array([values for _, values in table])
+    x, y, z, w = (values[:, 4:] / np.linalg.norm(values[:, 4:], axis=1, keepdims=True)).T
+    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return values[:, 0].copy(), np.column_stack([values[:, 1:3], heading])
+
+
+def write(path: str | PathLike, times: np.ndarray, poses: np.ndarray) -> None:
+    """Write a trajectory; every number is read back as it was.
+
+    Args:
+        path: File to write, all of it or nothing.
+        times: (N,) [s].
+        poses: (N, 3) [m, m, rad].
+
+    Raises:
+        InputError: The arrays do not fit together, hold NaN or infinity, or cannot be written.
+    """
+    times, poses = np.asarray(times, np.float64), np.asarray(poses, np.float64)
+    if times.ndim != 1 or poses.shape != (times.size, 3):
+        problem = f"times {times.shape} and poses {poses.shape} are not (N,) and (N, 3)"
+        raise InputError(problem, path=path)
+    bad = ~np.isfinite(np.column_stack([times, poses])).all(axis=1)
+    if bad.any():
+        problem = f"pose {int(np.argmax(bad))} is not finite"
+        raise InputError(problem, path=path, advice="write only the poses before it")
+    text = "".join(
+        f"{t!r} {x!r} {y!r} 0 0 0 {math.sin(heading / 2)!r} {math.cos(heading / 2)!r}\n"
+        for t, (x, y, heading) in zip(times.tolist(), poses.tolist(), strict=True)
+    )
+    write_text(path, "# t x y z qx qy qz qw\n" + text)

@@ -1,0 +1,72 @@
+"""The laser scanner: what it is, and what it sees of a world."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.geometry import cross, unit
+from jaxslam.types import Array, Key
+from jaxslam.world import World
+
+SEAM = 1e-5  # part of a wall's length
+
+
+class Lidar(NamedTuple):
+    """A 2-D laser scanner at the origin of the robot frame; static under jit."""
+
+    beams: int = 361  # R
+    first: float = -math.pi / 2  # [rad] direction of beam 0, robot frame
+    step: float = math.pi / 360  # [rad] from one beam to the next
+    reach: float = 10.0  # [m] beyond this nothing returns
+    noise: float = 0.01  # [m] standard deviation of a range
+
+
+class Scan(NamedTuple):
+    """One turn of the scanner."""
+
+    ranges: Array  # (R,) [m]; the lidar's reach where nothing was hit
+    hit: Array  # (R,) bool, False where nothing returned
+
+
+def bearings(lidar: Lidar) -> Array:
+    """Directions (R,) [rad] of the beams in the robot frame."""
+    return lidar.first + lidar.step * jnp.arange(lidar.beams, dtype=float)
+
+
+def points(scan: Scan, lidar: Lidar) -> Array:
+    """Ends (R, 2) [m] of the beams in the robot frame."""
+    return scan.ranges[:, None] * unit(bearings(lidar))
+
+
+def cast(world: World, pose: Array, lidar: Lidar) -> Scan:
+    """Noise-free scan of `world` from `pose` (3,).
+
+    A beam along unit vector u from p meets the wall a + s (b - a), 0 <= s <= 1, at the distance
+    t = (a - p) x (b - a) / (u x (b - a)). Walls are stretched by `SEAM` of their length, so that no
+    beam slips between two that share a corner.
+    """
+    beam = unit(pose[2] + bearings(lidar))[:, None, :]  # (R, 1, 2)
+    start = (world.walls[:, :2] - pose[None, :2])[None]  # (1, S, 2)
+    along = (world.walls[:, 2:] - world.walls[:, :2])[None]  # (1, S, 2)
+    slope = cross(beam, along)  # (R, S)
+    crosses = jnp.abs(slope) > 1e-9
+    safe = jnp.where(crosses, slope, 1.0)
+    distance = cross(start, along) / safe
+    part = cross(start, beam) / safe
+    met = crosses & (distance > 1e-6) & (jnp.abs(part - 0.5) <= 0.5 + SEAM)
+    ranges = jnp.min(jnp.where(met, distance, jnp.inf), axis=1)
+    return limit(ranges, lidar)
+
+
+def limit(ranges: Array, lidar: Lidar) -> Scan:
+    """Scan of raw ranges (R,) [m]; NaN, infinite or beyond the reach means nothing returned."""
+    hit = (ranges > 0.0) & (ranges < lidar.reach)  # NaN compares false
+    return Scan(ranges=jnp.where(hit, ranges, lidar.reach), hit=hit)
+
+
+def disturb(key: Key, scan: Scan, lidar: Lidar) -> Scan:
+    """Add the lidar's range noise to a scan; readings pushed beyond the reach are lost."""
+    noise = lidar.noise * jax.random.normal(key, scan.ranges.shape, scan.ranges.dtype)
+    return limit(jnp.where(scan.hit, scan.ranges + noise, jnp.inf), lidar)

@@ -1,0 +1,345 @@
+"""Landmarks of one scan: junctions of the Voronoi diagram, corners, and wall directions.
+
+A junction is the centre of a circle that touches three or more walls. The automaton finds the
+cell; the circle is then fitted to the line fits of the runs, which gives it sub-cell accuracy,
+and a covariance from theirs.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxslam.edges import Runs
+from jaxslam.geometry import cross, dot, wrap_angle, wrap_line
+from jaxslam.grid import GridSpec, centre_of
+from jaxslam.lidar import Lidar, Scan, points
+from jaxslam.types import CORNER, NODE, WALL, Array
+
+
+class Nodes(NamedTuple):
+    """Landmarks seen in one scan, of all three kinds, padded to M; robot frame."""
+
+    kind: Array  # (M,) int32: NODE, CORNER or WALL
+    xy: Array  # (M, 2) [m] position; zero for a wall direction
+    cov: Array  # (M, 2, 2) [m^2] of the position
+    direction: Array  # (M,) [rad] corner: towards its free side; wall: of its line; node: 0
+    variance: Array  # (M,) [rad^2] of a wall's direction
+    shape: Array  # (M,) node: clearance [m]; corner: angle of its free side [rad]; wall: 0
+    degree: Array  # (M,) int32 number of walls the circle of a node touches
+    certified: Array  # (M,) bool, nothing unseen inside the circle of a node
+    valid: Array  # (M,) bool, False marks padding
+
+
+class NodeSpec(NamedTuple):
+    """How many landmarks a scan may have, and what makes them; static under jit."""
+
+    nodes: int = 6
+    corners: int = 6
+    walls: int = 3
+    candidates: int = 24  # junction cells looked at
+    least: float = 0.35  # [m] smallest clearance of a node
+    most: float = 3.2  # [m] largest
+    apart: float = 0.7  # [rad] three feet of a node must differ by this, seen from it
+    wall_length: float = 1.0  # [m] of a run whose direction counts
+    corner_length: float = 0.3  # [m] of the runs of a corner
+    corner_angle: float = 0.6  # [rad] by which these must turn
+    touch: float = 0.1  # [m] walls this close to the circle of a node touch it
+
+    @property
+    def size(self) -> int:
+        """Number of landmarks M of a scan."""
+        return self.nodes + self.corners + self.walls
+
+
+class Feet(NamedTuple):
+    """Nearest point of each run, seen from one place."""
+
+    distance: Array  # (K,) [m] to the run
+    toward: Array  # (K, 2) unit vector to the foot
+    along: Array  # (K,) [m] where the foot lies on the line, from its centre
+    end: Array  # (K,) int32: 0 or 1 where the foot is that end of the run, 2 inside it
+
+
+def feet(place: Array, runs: Runs) -> Feet:
+    """Feet of all runs seen from `place` (2,) [m, robot frame]."""
+    line = runs.along
+    along = dot(place - runs.centre, line)
+    low = dot(runs.ends[:, 0] - runs.centre, line)
+    high = dot(runs.ends[:, 1] - runs.centre, line)
+    end = jnp.where(along < low, 0, jnp.where(along > high, 1, 2))
+    inside = runs.centre + along[:, None] * line
+    foot = jnp.where(
+        (end == 2)[:, None], inside, jnp.where((end == 0)[:, None], runs.ends[:, 0], runs.ends[:, 1])
+    )
+    offset = foot - place
+    near = jnp.sum(offset**2, axis=1) < 1e-8
+    distance = jnp.sqrt(jnp.where(near, 1e-8, jnp.sum(offset**2, axis=1)))
+    toward = jnp.where(near[:, None], runs.normal, offset / distance[:, None])
+    return Feet(
+        distance=jnp.where(runs.valid, distance, jnp.inf), toward=toward, along=along, end=end
+    )
+
+
+def solve3(a: Array, b: Array) -> Array:
+    """Solution (3, n) of a x = b, a (3, 3) and b (3, n), by the adjugate: no LAPACK in a batch."""
+    rows = jnp.stack([jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])])
+    determinant = jnp.sum(a[0] * rows[0])
+    safe = jnp.where(jnp.abs(determinant) > 1e-9, determinant, 1.0)
+    return jnp.where(jnp.abs(determinant) > 1e-9, (rows.T / safe) @ b, 1e3)
+
+
+class Circle(NamedTuple):
+    """A circle that touches walls."""
+
+    centre: Array  # (2,) [m] robot frame
+    radius: Array  # () [m]
+    cov: Array  # (2, 2) [m^2] of the centre
+    error: Array  # () [m] largest distance of a touched wall from the circle
+    spread: Array  # () [rad] smallest angle between the three feet that differ most
+    touched: Array  # (K,) bool
+    real: Array  # () bool, every foot is one
+
+
+def tangent_circle(place: Array, runs: Runs, spec: NodeSpec) -> Circle:
+    """Fit the circle that touches the walls nearest to `place` (2,) [m, robot frame].
+
+    Gauss-Newton on distance_k(c) - r = 0 over the runs k that are near the circle; how near is
+    asked more strictly from step to step. By the implicit function theorem the error of the
+    centre is A^+ times that of the feet, A having the rows (toward the foot, 1).
+    """
+
+    def step(now, tolerance):
+        centre, radius = now
+        f = feet(centre, runs)
+        radius = jnp.where(jnp.isfinite(radius), radius, jnp.min(f.distance))
+        touched = jnp.abs(f.distance - radius) < tolerance
+        w = touched.astype(place.dtype)
+        rows = jnp.concatenate([f.toward, jnp.ones_like(w)[:, None]], axis=1)
+        residual = jnp.where(touched, f.distance - radius, 0.0)
+        normal = (rows * w[:, None]).T @ rows + 1e-4 * jnp.eye(3, dtype=place.dtype)
+        move = solve3(normal, (rows * w[:, None]).T @ residual[:, None])[:, 0]
+        move = jnp.clip(move, -0.3, 0.3)
+        return (centre + move[:2], radius + move[2]), None
+
+    tolerances = spec.touch * jnp.array([4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0], place.dtype)
+    start = (place, jnp.asarray(jnp.inf, place.dtype))
+    (centre, radius), _ = lax.scan(step, start, tolerances)
+
+    f = feet(centre, runs)
+    touched = jnp.abs(f.distance - radius) < spec.touch
+    w = touched.astype(place.dtype)
+    at_end = jnp.clip(f.end, 0, 1)[:, None]
+    of_end = jnp.take_along_axis(runs.end_variance, at_end, axis=1)[:, 0]
+    variance = jnp.where(f.end == 2, runs.line_variance(f.along), of_end)
+    rows = jnp.concatenate([f.toward, jnp.ones_like(w)[:, None]], axis=1) * w[:, None]
+    gain = solve3(rows.T @ rows + 1e-6 * jnp.eye(3, dtype=place.dtype), rows.T)[:2]
+    real = jnp.take_along_axis(runs.real, at_end, axis=1)[:, 0] | (f.end == 2)
+    return Circle(
+        centre=centre,
+        radius=radius,
+        cov=(gain * jnp.where(touched, variance, 0.0)) @ gain.T,
+        error=jnp.max(jnp.where(touched, jnp.abs(f.distance - radius), 0.0)),
+        spread=_spread(f.toward, touched),
+        touched=touched,
+        real=jnp.all(real | ~touched),
+    )
+
+
+def _spread(toward: Array, touched: Array) -> Array:
+    """Smallest angle [rad] between three feet chosen to differ as much as they can."""
+    angle = jnp.arctan2(toward[:, 1], toward[:, 0])
+    apart = jnp.abs(wrap_angle(angle[:, None] - angle[None, :]))  # (K, K)
+    a = jnp.argmax(touched)
+    from_a = jnp.where(touched, apart[a], -1.0)
+    b = jnp.argmax(from_a)
+    from_both = jnp.where(touched, jnp.minimum(apart[a], apart[b]), -1.0)
+    return jnp.minimum(jnp.max(from_both), apart[a, b])
+
+
+def _peaks(cells: Array, rank: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
+    """Places (count, 2) [m] of the cells (H, W) whose rank is the largest within two cells."""
+    h, w = cells.shape
+    index = jnp.arange(h * w, dtype=jnp.int32).reshape(h, w)
+    # Unique in float32: at most 255 steps and 65,536 cells.
+    key = jnp.where(cells, (rank * 65536 + (index * 40503) % 65536).astype(jnp.float32), 0.0)
+    p = jnp.pad(key, 2)
+    rows = jnp.max(jnp.stack([p[i : i + h] for i in range(5)]), axis=0)
+    best = jnp.max(jnp.stack([rows[:, j : j + w] for j in range(5)]), axis=0)
+    key = jnp.where(key == best, key, 0.0)
+    # Peaks are at least three cells apart, so that a 3 x 3 block holds one at most.
+    p = jnp.pad(key, ((0, -h % 3), (0, -w % 3)))
+    blocks = p.reshape(p.shape[0] // 3, 3, p.shape[1] // 3, 3)
+    where = jnp.pad(index, ((0, -h % 3), (0, -w % 3))).reshape(blocks.shape)
+    peak = jnp.max(blocks, axis=(1, 3))
+    place = jnp.max(jnp.where(blocks == peak[:, None, :, None], where, 0), axis=(1, 3))
+    top, at = lax.top_k(peak.reshape(-1), count)
+    flat = place.reshape(-1)[at]
+    return centre_of(jnp.stack([flat // w, flat % w], axis=-1), spec), top > 0.0
+
+
+def _rim_seen(circle: Circle, scan: Scan, lidar: Lidar) -> Array:
+    """Whether a circle lies within what was seen.
+
+    What a scan sees is star-shaped around the robot, so it contains the disc if it contains the
+    rim; half a cell of slack for where it touches the walls.
+    """
+    turn = jnp.linspace(-jnp.pi, jnp.pi, 24, endpoint=False, dtype=scan.ranges.dtype)
+    rim = circle.centre + 0.95 * circle.radius * jnp.stack([jnp.cos(turn), jnp.sin(turn)], -1)
+    return jnp.all(_seen(rim, scan, lidar))
+
+
+def _seen(places: Array, scan: Scan, lidar: Lidar) -> Array:
+    """Whether places (N, 2) [m] lie before the ends of the beams next to them."""
+    beam = (jnp.arctan2(places[:, 1], places[:, 0]) - lidar.first) / lidar.step
+    low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.beams - 2)
+    within = (beam > -0.5) & (beam < lidar.beams - 0.5)
+    free = jnp.minimum(scan.ranges[low], scan.ranges[low + 1])
+    return within & (jnp.linalg.norm(places, axis=1) < free)
+
+
+def find_junctions(
+    cells: Array, arrival: Array, scan: Scan, runs: Runs, lidar: Lidar, grid: GridSpec, spec: NodeSpec
+) -> Nodes:
+    """Junctions of a Voronoi diagram as landmarks, the most trustworthy first.
+
+    A junction is kept when its circle is empty, touches at least three walls in directions that
+    differ, and every foot is real: no foot is an end made by occlusion or by the field of view.
+
+    Args:
+        cells: (H, W) bool, the junction cells.
+        arrival: (H, W) int32 steps the fronts took.
+        scan: The scan.
+        runs: Its straight runs.
+        lidar: The scanner.
+        grid: The grid of `cells`.
+        spec: Capacities and limits.
+    """
+    place, found = _peaks(cells, jnp.maximum(arrival, 0), grid, spec.candidates)
+    circle = jax.vmap(tangent_circle, in_axes=(0, None, None))(place, runs, spec)
+    hits = points(scan, lidar)
+    offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
+    clearance = jnp.min(jnp.where(scan.hit, offset, jnp.inf), axis=1)
+    size = jnp.trace(circle.cov, axis1=1, axis2=2)
+    good = found & circle.real & (circle.spread > spec.apart)
+    good &= (circle.radius > spec.least) & (circle.radius < spec.most)
+    good &= clearance > circle.radius - spec.touch
+    good &= jnp.linalg.norm(circle.centre - place, axis=1) < 0.6
+    good &= (size < 0.04) & _seen(circle.centre, scan, lidar)
+    certified = jax.vmap(_rim_seen, in_axes=(0, None, None))(circle, scan, lidar)
+    # Several cells may lead to one circle.
+    order = jnp.argsort(-(good * (1.0 + certified + 0.1 * circle.radius)), stable=True)
+    pick = lambda x: x[order]
+    centre, good = circle.centre[order], good[order]
+    gap = jnp.linalg.norm(centre[:, None] - centre[None], axis=2)
+    earlier = jnp.tril(jnp.ones(gap.shape, bool), -1)
+    good &= ~jnp.any(earlier & good[None, :] & (gap < 0.25), axis=1)
+    order = order[jnp.argsort(~good, stable=True)[: spec.nodes]]
+    good = jnp.sort(~good, stable=True)[: spec.nodes] == 0
+    zero = jnp.zeros(spec.nodes, place.dtype)
+    return _blank(
+        Nodes(
+            kind=jnp.full(spec.nodes, NODE, jnp.int32),
+            xy=circle.centre[order],
+            cov=circle.cov[order],
+            direction=zero,
+            variance=zero,
+            shape=circle.radius[order],
+            degree=circle.touched.sum(axis=1, dtype=jnp.int32)[order],
+            certified=certified[order],
+            valid=good,
+        )
+    )
+
+
+def find_corners(runs: Runs, spec: NodeSpec) -> Nodes:
+    """Corners in which two runs meet, the best located first.
+
+    A corner c solves n_k . c = n_k . centre_k for its two runs, which also gives its covariance.
+    The free side of a concave corner is narrower than a straight angle, of a convex one wider.
+    """
+    along = runs.along
+    following = jnp.roll(along, -1, axis=0)
+    turn = jnp.arctan2(cross(along, following), dot(along, following))
+    corner = runs.ends[:, 1]
+    s = runs.line_variance(dot(corner - runs.centre, along))
+    ahead = dot(corner - jnp.roll(runs.centre, -1, axis=0), following)
+    t = jnp.roll(runs.variance, -1) * (
+        1.0 / jnp.roll(runs.weight, -1) + ahead**2 / jnp.roll(runs.spread, -1)
+    )
+    # The inverse of the matrix of two unit normals has the other wall's direction as columns.
+    sine = jnp.where(runs.meets, jnp.sin(turn), 1.0)
+    first, second = following / sine[:, None], along / sine[:, None]
+    cov = s[:, None, None] * first[:, :, None] * first[:, None, :]
+    cov += t[:, None, None] * second[:, :, None] * second[:, None, :]
+    enough = (runs.weight >= 5) & (runs.length > spec.corner_length)
+    good = runs.meets & runs.valid & enough & jnp.roll(enough, -1)
+    good &= (jnp.abs(turn) > spec.corner_angle) & (jnp.abs(turn) < jnp.pi - spec.corner_angle)
+    size = jnp.where(good, cov[:, 0, 0] + cov[:, 1, 1], jnp.inf)
+    order = jnp.argsort(size, stable=True)[: spec.corners]
+    inward = jnp.arctan2(runs.normal[:, 1], runs.normal[:, 0]) + 0.5 * turn
+    zero = jnp.zeros(spec.corners, corner.dtype)
+    return _blank(
+        Nodes(
+            kind=jnp.full(spec.corners, CORNER, jnp.int32),
+            xy=corner[order],
+            cov=cov[order],
+            direction=wrap_angle(inward)[order],
+            variance=zero,
+            shape=(jnp.pi - turn)[order],
+            degree=jnp.full(spec.corners, 2, jnp.int32),
+            certified=jnp.ones(spec.corners, bool),
+            valid=(good & (size < 0.02))[order],
+        )
+    )
+
+
+def find_walls(runs: Runs, spec: NodeSpec) -> Nodes:
+    """Directions of the walls of a scan: groups of long parallel runs, the longest first.
+
+    No two directions need be at right angles: each is a landmark of its own.
+    """
+    angle = jnp.arctan2(runs.along[:, 1], runs.along[:, 0])
+    long = runs.valid & (runs.length > spec.wall_length) & (runs.weight >= 8)
+    precision = runs.spread / runs.variance
+    length = jnp.where(long, runs.length, 0.0)
+
+    def step(left, _):
+        best = jnp.argmax(left)
+        off = wrap_line(angle - angle[best])
+        member = (left > 0.0) & (jnp.abs(off) < 0.1)
+        w = jnp.where(member, precision, 0.0)
+        total = jnp.maximum(jnp.sum(w), 1e-6)
+        mean = wrap_line(angle[best] + jnp.sum(w * off) / total)
+        return jnp.where(member, 0.0, left), (mean, 1.0 / total, left[best] > 0.0)
+
+    _, (direction, variance, valid) = lax.scan(step, length, length=spec.walls)
+    return _blank(
+        Nodes(
+            kind=jnp.full(spec.walls, WALL, jnp.int32),
+            xy=jnp.zeros((spec.walls, 2), angle.dtype),
+            cov=jnp.zeros((spec.walls, 2, 2), angle.dtype),
+            direction=direction,
+            variance=variance,
+            shape=jnp.zeros(spec.walls, angle.dtype),
+            degree=jnp.zeros(spec.walls, jnp.int32),
+            certified=jnp.ones(spec.walls, bool),
+            valid=valid,
+        )
+    )
+
+
+def _blank(nodes: Nodes) -> Nodes:
+    """Set every number of the padding to zero."""
+    keep = nodes.valid
+
+    def clear(x: Array) -> Array:
+        return jnp.where(keep.reshape(keep.shape + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
+
+    return jax.tree.map(clear, nodes)._replace(kind=nodes.kind)
+
+
+def join(*parts: Nodes) -> Nodes:
+    """All landmarks of a scan in one record."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)

@@ -1,0 +1,188 @@
+"""SLAM of one robot: scan to features, one step of the filter, a whole log.
+
+`step` is the only place where front end and filter meet, and `run` the only loop over time.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxslam import association, edges, ekf, nodes, voronoi
+from jaxslam.edges import RunSpec
+from jaxslam.ekf import Belief
+from jaxslam.grid import GridSpec, rasterise, seen_free
+from jaxslam.lidar import Lidar, Scan
+from jaxslam.motion import process_noise
+from jaxslam.nodes import Nodes, NodeSpec
+from jaxslam.types import CORNER, NODE, WALL, Array
+
+
+class Config(NamedTuple):
+    """Everything that fixes shapes or decides; hashable, static under jit."""
+
+    lidar: Lidar = Lidar()
+    grid: GridSpec = GridSpec()
+    runs: RunSpec = RunSpec()
+    nodes: NodeSpec = NodeSpec()
+    labels: str = "runs"  # or "codes", the paper's
+    kinds: tuple[int, ...] = (NODE, CORNER, WALL)  # landmarks the filter uses
+    steps: int = 32  # of the automaton
+    landmarks: int = 96  # L
+    fresh: int = 4  # new landmarks a scan at most
+    gate: float = 9.21  # chi-square of 2 at 99 %
+    margin: float = 4.0  # squared distance between the best match and the next
+    far: float = 25.0  # squared distance from which a feature may be new
+    apart: float = 0.3  # [m] and distance from the next of its kind
+    wall_apart: float = 0.2  # [rad] likewise between wall directions
+    alike_shape: float = 0.3  # logarithm of the ratio of clearances
+    alike_turn: float = 0.5  # [rad] between directions of corners
+    confirm: int = 2  # sightings from which a landmark counts
+    patience: int = 40  # steps after which an unconfirmed one is dropped
+
+
+class Noise(NamedTuple):
+    """Standard deviations the filter assumes; traced, so that they can be tuned by gradient."""
+
+    odometry: Array  # (4,) distance per m^.5, per rad^.5; heading per m^.5, per rad^.5
+    range: Array  # () [m] of a landmark's range, beyond its own covariance
+    bearing: Array  # () [rad] likewise
+    scale: Array  # () factor on the landmark's own standard deviation
+    wall: Array  # () [rad] of a wall's direction, beyond its own variance
+
+
+class Inputs(NamedTuple):
+    """What the filter is given at a step."""
+
+    motion: Array  # (3,) odometry since the scan before
+    nodes: Nodes  # features of this scan
+
+
+class Info(NamedTuple):
+    """What is worth knowing of a step; the next one does not need it."""
+
+    pose: Array  # (3,)
+    pose_cov: Array  # (3, 3)
+    slot: Array  # (M,) int32 slot of each feature, matched or new; L for none
+    id: Array  # (M,) int32 its landmark's id, -1 for none
+    used: Array  # (M,) bool, the feature updated the state
+    nis: Array  # () squared Mahalanobis norm of the innovations
+    dof: Array  # () int32 and their number
+    log_likelihood: Array  # () [nats] of the innovations
+    finite: Array  # () bool, False where the update had to be left out
+
+
+def front_end(config: Config, scan: Scan) -> Nodes:
+    """Landmarks of one scan, robot frame."""
+    return look(config, scan)[0]
+
+
+def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
+    """Landmarks of one scan, with the diagram they came from and its source cells (H, W)."""
+    lidar, spec = config.lidar, config.grid
+    runs = edges.runs(scan, lidar, config.runs)
+    if config.labels == "codes":
+        grid = rasterise(scan, lidar, spec)
+        labels = edges.code_bits(edges.codes(grid, spec))
+        open = grid.free
+        sources = grid.occupied
+    else:
+        labels = edges.run_bits(scan, lidar, runs, spec)
+        open = seen_free(scan, lidar, spec)
+        sources = labels != 0
+    diagram = voronoi.expand(labels, open, steps=config.steps)
+    cells = voronoi.junctions(diagram, sources)
+    found = nodes.join(
+        nodes.find_junctions(cells, diagram.arrival, scan, runs, lidar, spec, config.nodes),
+        nodes.find_corners(runs, config.nodes),
+        nodes.find_walls(runs, config.nodes),
+    )
+    return found, diagram, sources
+
+
+def init(config: Config, pose: Array) -> Belief:
+    """Belief of a robot that starts at a known pose (3,) with an empty map."""
+    return ekf.initial(pose, landmarks=config.landmarks)
+
+
+def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
+    """Covariance (M, 2, 2) of the features in range and bearing, or in direction (and 0)."""
+    own = jax.vmap(ekf.polar_cov)(nodes.xy, nodes.cov)
+    floor = jnp.diag(jnp.stack([noise.range, noise.bearing]) ** 2)
+    point = noise.scale**2 * own + floor
+    wall = noise.scale**2 * nodes.variance + noise.wall**2
+    zero = jnp.zeros_like(wall)
+    wall = jnp.stack([jnp.stack([wall, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
+    return jnp.where((nodes.kind == WALL)[:, None, None], wall, point)
+
+
+def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Array) -> Array:
+    """Features (M,) bool that are far from all landmarks of their kind."""
+    same = (nodes.kind[:, None] == belief.kind) & (belief.seen > 0)
+    place = ekf.to_world(belief.pose, nodes.xy)
+    gap = jnp.linalg.norm(place[:, None] - belief.places[None], axis=2)
+    turn = jnp.abs(
+        ekf.wrap_line(nodes.direction[:, None] + belief.pose[2] - belief.places[None, :, 0])
+    )
+    is_wall = (nodes.kind == WALL)[:, None]
+    near = jnp.where(is_wall, turn < config.wall_apart, gap < config.apart)
+    near |= ~is_wall & (distance < config.far)
+    return nodes.valid & (slot == belief.seen.size) & ~jnp.any(same & near, axis=1)
+
+
+def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[Belief, Info]:
+    """Predict by odometry, match, update, take in new landmarks.
+
+    Matches are integers: derivatives are those of the filter with its matches held fixed.
+    """
+    seen = inputs.nodes
+    size = belief.seen.size
+    allowed = jnp.isin(seen.kind, jnp.array(config.kinds, jnp.int32))
+    seen = seen._replace(valid=seen.valid & allowed)
+    q = process_noise(noise.odometry, inputs.motion)
+    before = ekf.predict(belief, inputs.motion, q)._replace(step=belief.step + 1)
+    r = sensor_noise(noise, seen)
+
+    distance = lax.stop_gradient(ekf.distances(before, seen, r))
+    possible = ekf.alike(before, seen, shape=config.alike_shape, turn=config.alike_turn)
+    slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
+    counts = before.seen.at[slot].get(mode="fill", fill_value=0) + 1 >= config.confirm
+    used = (slot < size) & counts
+    rows = ekf.innovations(before, seen, r, jnp.where(used, slot, size))
+    after, nis, logdet = ekf.update(before, rows)
+    finite = jnp.all(jnp.isfinite(after.mean)) & jnp.isfinite(nis)
+    after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
+
+    after = ekf.note(after, seen, slot)
+    stale = (after.seen < config.confirm) & (after.step - after.last > config.patience)
+    after = ekf.forget(after, stale)
+    wanted = _new(config, before, seen, distance, slot) & finite
+    after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh)
+
+    slot = jnp.minimum(slot, fresh)
+    dof = jnp.sum(jnp.where(seen.kind == WALL, 1, 2) * used, dtype=jnp.int32)
+    density = nis + logdet + dof.astype(nis.dtype) * jnp.log(2 * jnp.pi).astype(nis.dtype)
+    info = Info(
+        pose=after.pose,
+        pose_cov=after.pose_cov,
+        slot=slot,
+        id=after.id.at[slot].get(mode="fill", fill_value=-1),
+        used=used,
+        nis=jnp.where(finite, nis, 0.0),
+        dof=dof,
+        log_likelihood=jnp.where(finite, -0.5 * density, 0.0),
+        finite=finite,
+    )
+    return after, info
+
+
+@partial(jax.jit, static_argnames="config")
+def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Belief, Info]:
+    """Filter one log: `inputs` leads with T, and so does the info."""
+
+    def body(belief: Belief, now: Inputs) -> tuple[Belief, Info]:
+        return step(config, noise, belief, now)
+
+    return lax.scan(body, start, inputs)

@@ -1,0 +1,17 @@
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of recorded logs, which are not part of the project."""
+    folder = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+    if not (folder / "intel" / "intel.clf").is_file():
+        pytest.skip("no recorded logs in ../shared/data beside the repository")
+    return folder

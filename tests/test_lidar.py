@@ -1,0 +1,103 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import world
+from jaxslam.geometry import compose, to_world
+from jaxslam.lidar import Lidar, Scan, bearings, cast, disturb, limit, points
+from jaxslam.world import World
+
+ROUND = Lidar(beams=360, first=-math.pi, step=math.pi / 180)
+ROOM = (-2.0, -1.0, 3.0, 2.0)
+
+
+def room_ranges(pose, lidar):
+    """Distances (R,) [m] to the sides of ROOM: each axis is left through the side ahead."""
+    angle = pose[2] + np.asarray(bearings(lidar))
+    with np.errstate(divide="ignore"):
+        x = np.where(np.cos(angle) > 0, ROOM[2] - pose[0], ROOM[0] - pose[0]) / np.cos(angle)
+        y = np.where(np.sin(angle) > 0, ROOM[3] - pose[1], ROOM[1] - pose[1]) / np.sin(angle)
+    return np.minimum(np.abs(x), np.abs(y))
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (1.3, -0.4, 0.7), (-1.9, 1.9, -3.0)])
+def test_cast_in_a_room_is_the_distance_to_its_sides(pose):
+    scan = cast(World(world.outline([ROOM])), jnp.array(pose), ROUND)
+    np.testing.assert_allclose(scan.ranges, room_ranges(pose, ROUND), atol=1e-9)
+    assert scan.hit.all()
+
+
+def test_ends_of_the_beams_lie_on_the_walls():
+    pose = jnp.array([1.3, -0.4, 0.7])
+    ends = to_world(pose, points(cast(World(world.outline([ROOM])), pose, ROUND), ROUND))
+    side = np.abs(np.asarray(ends)[:, [0, 1, 0, 1]] - np.array(ROOM)).min(axis=1)
+    np.testing.assert_allclose(side, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_turning_world_and_robot_together_changes_nothing(seed):
+    office, pose = world.named("office"), jnp.array([1.013, 0.917, 0.31])
+    turn = jax.random.uniform(jax.random.key(seed), (3,), minval=-3, maxval=3)
+    walls = to_world(turn, jnp.asarray(office.walls).reshape(-1, 2, 2)).reshape(-1, 4)
+    here, there = cast(office, pose, Lidar()), cast(World(walls), compose(turn, pose), Lidar())
+    np.testing.assert_allclose(there.ranges, here.ranges, atol=1e-9)
+    np.testing.assert_array_equal(there.hit, here.hit)
+
+
+def test_no_beam_slips_through_a_corner():
+    square = jnp.asarray(world.outline([(-1.0, -1.0, 1.0, 1.0)])).reshape(-1, 2, 2)
+    fan = Lidar(beams=8, first=-math.pi, step=math.pi / 4)  # every other beam meets a corner
+    turns = jax.random.uniform(jax.random.key(0), (2000, 3), minval=-3, maxval=3)
+
+    @jax.jit
+    @jax.vmap
+    def ranges(turn):
+        return cast(World(to_world(turn, square).reshape(-1, 4)), turn, fan).ranges
+
+    expected = np.tile([1, math.sqrt(2)] * 4, (2000, 1))
+    np.testing.assert_allclose(ranges(turns), expected, atol=1e-4)
+
+
+def test_nothing_returns_from_beyond_the_reach():
+    scan = cast(World(world.outline([ROOM])), jnp.zeros(3), ROUND._replace(reach=1.5))
+    near = room_ranges((0, 0, 0), ROUND) < 1.5
+    np.testing.assert_array_equal(scan.hit, near)
+    assert np.all(np.asarray(scan.ranges)[~near] == 1.5)
+
+
+def test_bad_readings_become_no_return():
+    lidar = Lidar(reach=5.0)
+    scan = limit(jnp.array([1.0, jnp.nan, jnp.inf, -jnp.inf, 0.0, -1.0, 5.0, 7.0]), lidar)
+    np.testing.assert_array_equal(scan.hit, [True] + 7 * [False])
+    np.testing.assert_array_equal(scan.ranges, [1.0] + 7 * [5.0])
+
+
+def test_noise_has_the_spread_it_says_and_spares_what_was_not_hit():
+    lidar, n = Lidar(noise=0.03), 20_000
+    scan = Scan(ranges=jnp.full(n, 2.0).at[:100].set(10.0), hit=jnp.arange(n) >= 100)
+    noisy = disturb(jax.random.key(0), scan, lidar)
+    error = np.asarray(noisy.ranges - scan.ranges)[100:]
+    assert abs(error.mean()) < 4 * 0.03 / np.sqrt(error.size)
+    assert abs(error.std() - 0.03) < 4 * 0.03 / np.sqrt(2 * error.size)
+    np.testing.assert_array_equal(noisy.hit, scan.hit)
+    np.testing.assert_array_equal(noisy.ranges[:100], 10.0)
+
+
+def test_readings_pushed_beyond_the_reach_are_lost():
+    lidar, n = Lidar(noise=0.03), 4000
+    scan = Scan(ranges=jnp.full(n, lidar.reach - 1e-9), hit=jnp.ones(n, bool))
+    lost = 1 - np.asarray(disturb(jax.random.key(1), scan, lidar).hit).mean()
+    assert abs(lost - 0.5) < 4 * 0.5 / np.sqrt(n)
+
+
+def test_scans_are_batched_and_differentiable():
+    office = world.named("office")
+    starts = jnp.array([[1.01, 0.9, 0.1], [3.5, 3.6, 1.2]])
+    ranges = jax.jit(lambda pose: cast(office, pose, Lidar()).ranges)
+    alone = jnp.stack([ranges(pose) for pose in starts])
+    np.testing.assert_allclose(jax.jit(jax.vmap(ranges))(starts), alone, atol=1e-12)
+    slope = jax.jit(jax.jacfwd(ranges))(starts[0])
+    assert jnp.isfinite(slope).all()

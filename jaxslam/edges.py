@@ -32,9 +32,8 @@ def codes(grid: Grid, spec: GridSpec) -> Array:
     References:
         Paper, section 2.2, Figs. 3 to 5.
     """
-    north, south, west, east = around(grid.occupied)
-    pattern = north + 2 * east.astype(jnp.uint8) + 4 * south.astype(jnp.uint8)
-    pattern = pattern + 8 * west.astype(jnp.uint8)
+    north, south, west, east = around(grid.occupied.astype(jnp.uint8))
+    pattern = north + 2 * east + 4 * south + 8 * west
     code = jnp.array(_CODES, jnp.uint8)[pattern]
     clockwise = centres(spec)[..., 1] < 0.0
     code = jnp.where(code == _SIDE, jnp.where(clockwise, 3, 4).astype(jnp.uint8), code)
@@ -80,7 +79,7 @@ class Runs(NamedTuple):
 class RunSpec(NamedTuple):
     """How scans are cut into runs; static under jit."""
 
-    capacity: int = 32  # K, one label bit each
+    capacity: int = 31  # K, one label bit each, and one for the automaton
     splits: int = 8  # rounds of splitting
     gap: float = 0.2  # [m] a step between beams below this is no jump
     bend: float = 0.06  # [m] a run whose points leave its chord by more is split
@@ -123,15 +122,6 @@ def _spans(breaks: Array) -> tuple[Array, Array]:
     return first, last
 
 
-def _running_max(values: Array, breaks: Array) -> Array:
-    """Largest value (R,) since the last break."""
-
-    def join(a, b):
-        return jnp.where(b[1], b[0], jnp.maximum(a[0], b[0])), a[1] | b[1]
-
-    return lax.associative_scan(join, (values, breaks))[0]
-
-
 def _split(xy: Array, breaks: Array, tolerance: Array, rounds: int) -> Array:
     """Break stretches where their points (R, 2) are furthest from their chord, if too far."""
 
@@ -142,8 +132,13 @@ def _split(xy: Array, breaks: Array, tolerance: Array, rounds: int) -> Array:
         off = jnp.abs(cross(chord, xy - start)) / size
         # A chord of almost no length says nothing of direction: take the distance to its start.
         off = jnp.where(size < 0.05, jnp.linalg.norm(xy - start, axis=1), off)
-        worst = _running_max(off, breaks)[last]
-        return breaks | ((off >= worst) & (off > tolerance)), None
+        # The running maximum of a stretch, in tenths of a millimetre: its first beam in the high
+        # bits makes every stretch begin anew.
+        tenths = jnp.minimum(off * 1e4, 2.0**18 - 1).astype(jnp.int32)
+        running = lax.cummax(first * 2**18 + tenths)
+        worst = running == running[last]
+        leads = worst & ~jnp.roll(worst, 1).at[0].set(False)
+        return breaks | (leads & (off > tolerance)), None
 
     return lax.scan(step, breaks, length=rounds)[0]
 
@@ -193,8 +188,8 @@ def _fit(xy: Array, member: Array, noise: float) -> tuple[Array, ...]:
 def _merge(breaks: Array, xy: Array, scan: Scan, jump: Array, lidar: Lidar, spec: RunSpec) -> Array:
     """Undo breaks between neighbours that lie on one line."""
     of_beam = _claim(breaks, scan.hit, spec.capacity)
-    index = jnp.arange(spec.capacity)
-    member = of_beam == index[:, None]
+    index = jnp.arange(spec.capacity, dtype=jnp.int32)
+    member = of_beam[None] == index[:, None]
     normal, centre, variance, weight, spread = _fit(xy, member, lidar.noise)
     gap = jnp.roll(centre, -1, axis=0) - centre
     enough = weight >= 3
@@ -223,13 +218,14 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
 
     of_beam = _claim(breaks, scan.hit, spec.capacity)
     beam = jnp.arange(lidar.beams, dtype=jnp.int32)
-    member = of_beam == jnp.arange(spec.capacity, dtype=jnp.int32)[:, None]  # (K, R)
-    count = member.sum(axis=1)
-    first = jnp.min(jnp.where(member, beam, lidar.beams - 1), axis=1)
-    last = jnp.max(jnp.where(member, beam, 0), axis=1)
+    member = of_beam[None] == jnp.arange(spec.capacity, dtype=jnp.int32)[:, None]  # (K, R)
+    count = member.sum(axis=1, dtype=jnp.int32)
+    first = jnp.min(jnp.where(member, beam[None], lidar.beams - 1), axis=1)
+    last = jnp.max(jnp.where(member, beam[None], 0), axis=1)
     # The points next to a corner may belong to the other wall: leave them out of the fit.
     trim = jnp.where(count >= 8, 2, jnp.where(count >= 6, 1, 0))
-    inner = member & (beam >= (first + trim)[:, None]) & (beam <= (last - trim)[:, None])
+    inner = member & (beam[None] >= (first + trim)[:, None])
+    inner &= beam[None] <= (last - trim)[:, None]
     normal, centre, variance, weight, spread = _fit(xy, inner, lidar.noise)
     valid = count > 0
     fitted = count >= 3
@@ -303,7 +299,7 @@ def run_bits(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int 
     """
     xy, of = points(scan, lidar), runs.of_beam
     capacity = runs.valid.size
-    last = jnp.arange(of.size) == of.size - 1
+    last = jnp.arange(of.size, dtype=jnp.int32) == of.size - 1
     same = (of == jnp.roll(of, -1)) & (of < capacity - 1) & ~last
     part = jnp.where(same[:, None], jnp.arange(fill, dtype=xy.dtype) / fill, 0.0)
     drawn = xy[:, None] + part[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]

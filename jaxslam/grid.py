@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.types import Array
@@ -29,16 +30,26 @@ class Grid(NamedTuple):
     free: Array  # (H, W) bool, beams went through
 
 
+def corner(spec: GridSpec) -> np.ndarray:
+    """Corner (2,) [m, robot frame] of the grid at which cell [0, 0] lies."""
+    return -np.array([spec.behind, spec.side])
+
+
 def cell_of(points: Array, spec: GridSpec) -> Array:
-    """Cell index (..., 2) of points (..., 2) [m, robot frame]; H or W, which is nowhere, outside."""
-    index = jnp.floor((points + jnp.array([spec.behind, spec.side])) / spec.cell).astype(jnp.int32)
-    shape = jnp.array(spec.shape)
-    return jnp.where(jnp.all((index >= 0) & (index < shape), -1, keepdims=True), index, shape)
+    """Cell index (..., 2) of points (..., 2) [m, robot frame]; (H, W), nowhere, if outside."""
+    lead = (1,) * (points.ndim - 1)
+    origin = jnp.asarray(corner(spec), points.dtype).reshape(*lead, 2)
+    shape = jnp.array(spec.shape, jnp.int32).reshape(*lead, 2)
+    # In floating point first: an infinite coordinate has no integer.
+    index = jnp.floor((points - origin) / spec.cell)
+    inside = jnp.all((index >= 0.0) & (index < shape.astype(index.dtype)), axis=-1, keepdims=True)
+    return jnp.where(inside, jnp.where(inside, index, 0.0).astype(jnp.int32), shape)
 
 
 def centre_of(index: Array, spec: GridSpec) -> Array:
     """Centre (..., 2) [m, robot frame] of the cells with index (..., 2)."""
-    return (index + 0.5) * spec.cell - jnp.array([spec.behind, spec.side])
+    origin = jnp.asarray(corner(spec), float).reshape(*(1,) * (index.ndim - 1), 2)
+    return origin + (index.astype(float) + 0.5) * spec.cell
 
 
 def centres(spec: GridSpec) -> Array:
@@ -48,14 +59,14 @@ def centres(spec: GridSpec) -> Array:
 
 def seen_free(scan: Scan, lidar: Lidar, spec: GridSpec) -> Array:
     """Cells (H, W) whose centre both bracketing beams pass."""
-    xy = centres(spec)
-    away = jnp.hypot(xy[..., 0], xy[..., 1])
-    beam = (jnp.arctan2(xy[..., 1], xy[..., 0]) - lidar.first) / lidar.step
-    beam = jnp.where(beam < -0.5, beam + 2 * jnp.pi / lidar.step, beam)
-    low = jnp.floor(beam).astype(jnp.int32)
+    # Which beams these are is a matter of static values, so NumPy works it out while tracing.
+    x, y = (np.indices(spec.shape) + 0.5) * spec.cell + corner(spec)[:, None, None]
+    beam = (np.arctan2(y, x) - lidar.first) / lidar.step
+    beam = np.where(beam < -0.5, beam + 2 * np.pi / lidar.step, beam)
     within = (beam > -0.5) & (beam < lidar.beams - 0.5)
-    shorter = jnp.minimum(scan.ranges[:-1], scan.ranges[1:])
-    return within & (away < shorter[jnp.clip(low, 0, lidar.beams - 2)])
+    low = np.clip(np.floor(beam), 0, lidar.beams - 2).astype(np.int32)
+    away = jnp.asarray(np.hypot(x, y), scan.ranges.dtype)
+    return within & (away < jnp.minimum(scan.ranges[:-1], scan.ranges[1:])[low])
 
 
 def mark(index: Array, spec: GridSpec) -> Array:
@@ -70,7 +81,7 @@ def rasterise(scan: Scan, lidar: Lidar, spec: GridSpec) -> Grid:
     of the beam, along both where their ratio is at least one half; it never covers a free cell.
     """
     xy = points(scan, lidar)
-    nowhere = jnp.array(spec.shape)
+    nowhere = jnp.array(spec.shape, jnp.int32)[None]
     index = jnp.where(scan.hit[:, None], cell_of(xy, spec), nowhere)
     front = mark(index, spec)
     free = seen_free(scan, lidar, spec) & ~front

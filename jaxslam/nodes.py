@@ -9,11 +9,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxslam.edges import Runs
 from jaxslam.geometry import cross, dot, wrap_angle, wrap_line
-from jaxslam.grid import GridSpec, centre_of
+from jaxslam.grid import GridSpec, centre_of, corner
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.types import CORNER, NODE, WALL, Array
 
@@ -158,25 +159,32 @@ def _spread(toward: Array, touched: Array) -> Array:
     return jnp.minimum(jnp.max(from_both), apart[a, b])
 
 
-def _peaks(cells: Array, rank: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
-    """Places (count, 2) [m] of the cells (H, W) whose rank is the largest within two cells."""
+def _peaks(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
+    """Places (count, 2) [m] of groups of cells (H, W) bool, the nearest to the robot first.
+
+    Of the marked cells that lie within two or three cells of each other, the nearest stands for all.
+    """
     h, w = cells.shape
-    index = jnp.arange(h * w, dtype=jnp.int32).reshape(h, w)
-    # Unique in float32: at most 255 steps and 65,536 cells.
-    key = jnp.where(cells, (rank * 65536 + (index * 40503) % 65536).astype(jnp.float32), 0.0)
-    p = jnp.pad(key, 2)
-    rows = jnp.max(jnp.stack([p[i : i + h] for i in range(5)]), axis=0)
-    best = jnp.max(jnp.stack([rows[:, j : j + w] for j in range(5)]), axis=0)
-    key = jnp.where(key == best, key, 0.0)
-    # Peaks are at least three cells apart, so that a 3 x 3 block holds one at most.
-    p = jnp.pad(key, ((0, -h % 3), (0, -w % 3)))
-    blocks = p.reshape(p.shape[0] // 3, 3, p.shape[1] // 3, 3)
-    where = jnp.pad(index, ((0, -h % 3), (0, -w % 3))).reshape(blocks.shape)
-    peak = jnp.max(blocks, axis=(1, 3))
-    place = jnp.max(jnp.where(blocks == peak[:, None, :, None], where, 0), axis=(1, 3))
-    top, at = lax.top_k(peak.reshape(-1), count)
-    flat = place.reshape(-1)[at]
+    away = np.hypot(*((np.indices(spec.shape) + 0.5) * spec.cell + corner(spec)[:, None, None]))
+    by_rank = np.argsort(-away, axis=None, kind="stable")
+    rank = np.empty(h * w, np.float32)
+    rank[by_rank] = np.arange(1, h * w + 1)
+    key = jnp.where(cells, jnp.asarray(rank.reshape(h, w)), jnp.float32(0.0))
+    pairs = _halve(key)
+    p = jnp.pad(pairs, 1)
+    rows = jnp.maximum(jnp.maximum(p[:-2], p[2:]), p[1:-1])
+    best = jnp.maximum(jnp.maximum(rows[:, :-2], rows[:, 2:]), rows[:, 1:-1])
+    peaks = _halve(jnp.where(pairs == best, pairs, 0.0))  # one at most in every 2 x 2
+    top, _ = lax.top_k(peaks.reshape(-1), count)
+    flat = jnp.asarray(by_rank.astype(np.int32))[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
     return centre_of(jnp.stack([flat // w, flat % w], axis=-1), spec), top > 0.0
+
+
+def _halve(x: Array) -> Array:
+    """Largest value of each 2 x 2 block of (H, W)."""
+    x = jnp.pad(x, ((0, x.shape[0] % 2), (0, x.shape[1] % 2)))
+    x = jnp.maximum(x[::2], x[1::2])
+    return jnp.maximum(x[:, ::2], x[:, 1::2])
 
 
 def _rim_seen(circle: Circle, scan: Scan, lidar: Lidar) -> Array:
@@ -200,7 +208,7 @@ def _seen(places: Array, scan: Scan, lidar: Lidar) -> Array:
 
 
 def find_junctions(
-    cells: Array, arrival: Array, scan: Scan, runs: Runs, lidar: Lidar, grid: GridSpec, spec: NodeSpec
+    cells: Array, scan: Scan, runs: Runs, lidar: Lidar, grid: GridSpec, spec: NodeSpec
 ) -> Nodes:
     """Junctions of a Voronoi diagram as landmarks, the most trustworthy first.
 
@@ -209,14 +217,13 @@ def find_junctions(
 
     Args:
         cells: (H, W) bool, the junction cells.
-        arrival: (H, W) int32 steps the fronts took.
         scan: The scan.
         runs: Its straight runs.
         lidar: The scanner.
         grid: The grid of `cells`.
         spec: Capacities and limits.
     """
-    place, found = _peaks(cells, jnp.maximum(arrival, 0), grid, spec.candidates)
+    place, found = _peaks(cells, grid, spec.candidates)
     circle = jax.vmap(tangent_circle, in_axes=(0, None, None))(place, runs, spec)
     hits = points(scan, lidar)
     offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
@@ -262,9 +269,9 @@ def find_corners(runs: Runs, spec: NodeSpec) -> Nodes:
     along = runs.along
     following = jnp.roll(along, -1, axis=0)
     turn = jnp.arctan2(cross(along, following), dot(along, following))
-    corner = runs.ends[:, 1]
-    s = runs.line_variance(dot(corner - runs.centre, along))
-    ahead = dot(corner - jnp.roll(runs.centre, -1, axis=0), following)
+    place = runs.ends[:, 1]
+    s = runs.line_variance(dot(place - runs.centre, along))
+    ahead = dot(place - jnp.roll(runs.centre, -1, axis=0), following)
     t = jnp.roll(runs.variance, -1) * (
         1.0 / jnp.roll(runs.weight, -1) + ahead**2 / jnp.roll(runs.spread, -1)
     )
@@ -279,11 +286,11 @@ def find_corners(runs: Runs, spec: NodeSpec) -> Nodes:
     size = jnp.where(good, cov[:, 0, 0] + cov[:, 1, 1], jnp.inf)
     order = jnp.argsort(size, stable=True)[: spec.corners]
     inward = jnp.arctan2(runs.normal[:, 1], runs.normal[:, 0]) + 0.5 * turn
-    zero = jnp.zeros(spec.corners, corner.dtype)
+    zero = jnp.zeros(spec.corners, place.dtype)
     return _blank(
         Nodes(
             kind=jnp.full(spec.corners, CORNER, jnp.int32),
-            xy=corner[order],
+            xy=place[order],
             cov=cov[order],
             direction=wrap_angle(inward)[order],
             variance=zero,

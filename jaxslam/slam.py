@@ -95,7 +95,7 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
     diagram = voronoi.expand(labels, open, steps=config.steps)
     cells = voronoi.junctions(diagram, sources)
     found = nodes.join(
-        nodes.find_junctions(cells, diagram.arrival, scan, runs, lidar, spec, config.nodes),
+        nodes.find_junctions(cells, scan, runs, lidar, spec, config.nodes),
         nodes.find_corners(runs, config.nodes),
         nodes.find_walls(runs, config.nodes),
     )

@@ -46,27 +46,37 @@ def expand(labels: Array, open: Array, *, steps: int) -> Diagram:
     """Expand all sources together for a fixed number of steps.
 
     Args:
-        labels: (H, W) unsigned bit sets; non-zero cells are the sources.
+        labels: (H, W) unsigned bit sets that leave the highest bit free: 7 labels in uint8, 15 in
+            uint16, 31 in uint32; non-zero cells are the sources.
         open: (H, W) bool, the cells that fronts may enter.
         steps: Number of steps; a front advances one cell a step.
 
     References:
         Paper, section 2.1, Figs. 1 and 2.
     """
-    # A ring of empty cells stays around the grid, so that no step has to pad it.
-    start = jnp.pad(labels, 1)
+    # Signed cells carry a mark in the sign bit: what is negative passes nothing on, be it a cell
+    # in which fronts met or a closed one. A ring of closed cells stays around the grid, so that
+    # no step has to pad it.
+    signed = jnp.dtype(f"int{8 * labels.dtype.itemsize}")
+    mark = jnp.iinfo(signed).min
+    cells = lax.bitcast_convert_type(labels, signed)
+    cells = jnp.where(labels & (labels - 1) != 0, cells | mark, cells)
+    cells = jnp.where((cells == 0) & ~open, mark, cells)
+    start = jnp.pad(cells, 1, constant_values=mark)
 
     def step(now, _):
         cells, waited = now
-        fronts = single(cells)
+        fronts = jnp.maximum(cells, 0)
         union = fronts[2:, 1:-1] | fronts[:-2, 1:-1] | fronts[1:-1, 2:] | fronts[1:-1, :-2]
+        met = jnp.where(union & (union - 1) != 0, union | mark, union)
         inner = cells[1:-1, 1:-1]
-        inner = jnp.where((inner == 0) & open, union, inner)
-        return (lax.dynamic_update_slice(cells, inner, (1, 1)), waited + (inner == 0)), None
+        inner = jnp.where(inner == 0, met, inner)
+        waited = waited + (inner == 0).astype(waited.dtype)
+        return (lax.dynamic_update_slice(cells, inner, (1, 1)), waited), None
 
     # waited: the steps after which a cell was still empty, so it is reached at waited + 1.
     (cells, waited), _ = lax.scan(step, (start, jnp.zeros(labels.shape, jnp.int16)), length=steps)
-    cells = cells[1:-1, 1:-1]
+    cells = lax.bitcast_convert_type(cells[1:-1, 1:-1] & ~mark, labels.dtype)
     arrival = jnp.where(labels != 0, 0, waited.astype(jnp.int32) + 1)
     return Diagram(labels=cells, arrival=jnp.where(cells != 0, arrival, -1))
 

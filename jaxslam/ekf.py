@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
+from jax import lax
 
 from jaxslam.association import claim_slots
 from jaxslam.geometry import compose, range_bearing, rotation, to_world, wrap_angle, wrap_line
@@ -214,6 +214,28 @@ def innovations(belief: Belief, nodes: Nodes, noise: Array, slot: Array) -> Inno
     )
 
 
+def whiten(s: Array, b: Array) -> tuple[Array, Array]:
+    """Return L^-1 b (n, k) and log det S () of S = L L^T (n, n), for b (n, k).
+
+    Forward elimination of [S, b], one row a step, in array operations alone: programs that call
+    LAPACK can hang when several run at once on the threads of one CPU.
+    """
+    n = s.shape[0]
+    index = jnp.arange(n)
+
+    def eliminate(left: Array, k: Array) -> tuple[Array, tuple[Array, Array]]:
+        row = lax.dynamic_index_in_dim(left, k, keepdims=False)
+        pivot = lax.dynamic_index_in_dim(row, k, keepdims=False)
+        # S is positive definite; if rounding or nonsense made it otherwise, say so with NaN.
+        row = row / jnp.sqrt(jnp.where(pivot > 0.0, pivot, jnp.nan))
+        # The column below the pivot is the row to its right: S stays symmetric.
+        factor = jnp.where(index > k, row[:n], 0.0)
+        return left - factor[:, None] * row[None, :], (row[n:], jnp.log(pivot))
+
+    _, (white, logs) = lax.scan(eliminate, jnp.concatenate([s, b], axis=1), index)
+    return white, jnp.sum(logs)
+
+
 def update(belief: Belief, seen: Innovations) -> tuple[Belief, Array, Array]:
     """Condition on all innovations of a scan at once.
 
@@ -239,14 +261,10 @@ def update(belief: Belief, seen: Innovations) -> tuple[Belief, Array, Array]:
     s += jnp.einsum("rmi,mki->rmk", gathered, seen.by_slot)
     index = jnp.arange(m)
     s = s.reshape(m, 2, m, 2).at[index, :, index].add(seen.noise).reshape(2 * m, 2 * m)
-    lower = jnp.linalg.cholesky(s)
-    white = solve_triangular(
-        lower, jnp.concatenate([hp, seen.residual.reshape(-1, 1)], axis=1), lower=True
-    )
+    white, logdet = whiten(s, jnp.concatenate([hp, seen.residual.reshape(-1, 1)], axis=1))
     y, v = white[:, :-1], white[:, -1]
     mean = belief.mean + v @ y
     mean = mean.at[2].set(wrap_angle(mean[2]))
-    logdet = 2 * jnp.sum(jnp.log(jnp.diagonal(lower)))
     return belief._replace(mean=mean, cov=cov - y.T @ y), v @ v, logdet
 
 

@@ -3,9 +3,11 @@
 The only module, beside `fit`, in which arrays lead with B, the runs.
 """
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +19,13 @@ from jaxslam.geometry import compose
 from jaxslam.metrics import nees, pose_error
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
-from jaxslam.slam import Config, Info, Inputs, Noise
+from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array, Key
 from jaxslam.world import World
 
 SUBSTEPS = 4  # parts in which the wheels' noise is drawn between two scans
 SCANS = 16  # scans of a run that are looked at together
+RUNS = 4  # runs that are filtered together
 
 
 class Log(NamedTuple):
@@ -45,14 +48,22 @@ class Track(NamedTuple):
     finite: Array  # () bool
 
 
-class Summary(NamedTuple):
-    """Errors over all runs and steps; diverged runs are counted, runs with NaN left out."""
+def map_batches(function: Callable, items: Any, *, size: int) -> Any:
+    """Map `function` over the leading axis of `items`, `size` of them vectorised at a time.
 
-    position_rmse: Array  # [m]
-    heading_rmse: Array  # [rad]
-    nees: Array  # mean over runs and steps, per degree of freedom of the pose
-    diverged: Array  # runs whose final position error exceeds 1 m, or is not a number
-    runs: Array
+    The last batch is filled up with the last item: unlike `lax.map(batch_size=...)` this compiles
+    the function once.
+    """
+    count = jax.tree.leaves(items)[0].shape[0]
+    size = min(size, count)
+    pad = -count % size
+
+    def fold(x: Array) -> Array:
+        x = jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x
+        return x.reshape((-1, size) + x.shape[1:])
+
+    result = lax.map(jax.vmap(function), jax.tree.map(fold, items))
+    return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:])[:count], result)
 
 
 def start(path: Array) -> Array:
@@ -101,23 +112,29 @@ def simulate_one(
         scan = lidar.cast(world, pose, config.lidar)
         return slam.front_end(config, lidar.disturb(scan_key, scan, config.lidar))
 
-    seen = lax.map(look, (truth, jax.random.split(scan_key, steps)), batch_size=SCANS)
+    seen = map_batches(look, (truth, jax.random.split(scan_key, steps)), size=SCANS)
     return Log(truth=truth, motion=told, nodes=seen)
 
 
 @partial(jax.jit, static_argnames=("config", "robot", "steps"))
-def _simulate(keys, config, world, robot, path, *, steps) -> Log:
-    return lax.map(
-        lambda key: simulate_one(key, config, world, robot, path, steps=steps), keys
-    )
+def simulate_keys(
+    keys: Key, config: Config, world: World, robot: Robot, path: Array, *, steps: int
+) -> Log:
+    """Simulate one run of `steps` scans for each of the keys (B,)."""
+    return lax.map(lambda key: simulate_one(key, config, world, robot, path, steps=steps), keys)
+
+
+def run_keys(key: Key, runs: Array) -> Key:
+    """Keys (B,) of the runs with numbers (B,): one run can be replayed without the others."""
+    return jax.vmap(partial(jax.random.fold_in, key))(runs)
 
 
 def simulate(
     key: Key, config: Config, world: World, robot: Robot, path: Array, *, runs: int, steps: int
 ) -> Log:
-    """Simulate B runs of `steps` scans along `path` (N, 2); run i has the key fold_in(key, i)."""
-    keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(runs))
-    return _simulate(keys, config, world, robot, path, steps=steps)
+    """Simulate runs 0 to B - 1, each of `steps` scans along `path` (N, 2)."""
+    keys = run_keys(key, jnp.arange(runs))
+    return simulate_keys(keys, config, world, robot, path, steps=steps)
 
 
 def dead_reckoning(first: Array, told: Array) -> Array:
@@ -148,5 +165,94 @@ def track(config: Config, noise: Noise, log: Log) -> Track:
 
 @partial(jax.jit, static_argnames="config")
 def tracks(config: Config, noise: Noise, logs: Log) -> Track:
-    """Filter B runs, all with the same noise."""
-    return jax.vmap(track, in_axes=(None, None, 0))(config, noise, logs)
+    """Filter B runs, all with the same noise; a few at a time, which stays in the cache."""
+    return map_batches(partial(track, config, noise), logs, size=RUNS)
+
+
+@partial(jax.jit, static_argnames=("config", "robot", "steps"))
+def _experiment(keys, config, noise, world, robot, path, *, steps) -> Track:
+    logs = simulate_keys(keys, config, world, robot, path, steps=steps)
+    return tracks(config, noise, logs)
+
+
+def experiment(
+    key: Key,
+    config: Config,
+    noise: Noise,
+    world: World,
+    robot: Robot,
+    path: Array,
+    *,
+    runs: int,
+    steps: int,
+    threads: int | None = None,
+) -> Iterator[Track]:
+    """Simulate and filter runs 0 to B - 1; yield their tracks a few runs at a time, in order.
+
+    Memory is bounded by the few runs under way. What is yielded holds NumPy arrays.
+
+    Args:
+        key: Key of the experiment; run i has `run_keys(key, i)`.
+        config: Of front end and filter.
+        noise: What the filter assumes.
+        world: The world.
+        robot: The robot, with the noise of its encoders.
+        path: (N, 2) way of the robot.
+        runs: B.
+        steps: Scans of a run.
+        threads: Groups of runs under way together; all cores by default.
+    """
+
+    def group(first: int) -> Track:
+        # A last, smaller group repeats its last run, so that nothing is compiled again.
+        numbers = jnp.minimum(first + jnp.arange(RUNS), runs - 1)
+        keys = run_keys(key, numbers)
+        done = _experiment(keys, config, noise, world, robot, path, steps=steps)
+        return jax.tree.map(lambda x: np.asarray(x)[: runs - first], done)
+
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        yield group(0)  # alone, so that it is compiled once
+        yield from pool.map(group, range(RUNS, runs, RUNS))
+
+
+def evaluate(tracks: Track) -> dict:
+    """Errors over all steps of all runs, with the keys of `metrics.json`.
+
+    A run has diverged when its final position error exceeds 1 m or is no number; runs with
+    numbers that are none are counted there and left out of the means.
+    """
+    tracks = jax.tree.map(np.asarray, tracks)
+    good = tracks.finite & np.all(np.isfinite(tracks.estimate), axis=(1, 2))
+    error = np.asarray(pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth)))
+    blind = np.asarray(pose_error(jnp.asarray(tracks.odometry), jnp.asarray(tracks.truth)))
+    final = np.linalg.norm(error[:, -1, :2], axis=-1)
+    diverged = np.flatnonzero(~good | ~(final <= 1.0))
+    # Until the first motion the pose is certain, and NEES has no meaning.
+    ratio = np.asarray(nees(jnp.asarray(error), jnp.asarray(tracks.cov)))
+    certain = np.trace(tracks.cov, axis1=-2, axis2=-1) < 1e-12
+    use = good[:, None] & ~certain & np.isfinite(ratio)
+    return {
+        "runs": len(error),
+        "scans": int(error.shape[0] * error.shape[1]),
+        **errors(error[good]),
+        "nees": float(np.mean(ratio[use]) / 3) if use.any() else None,
+        "diverged": len(diverged),
+        "diverged_runs": diverged.tolist(),
+        "landmarks": float(np.mean(tracks.landmarks)),
+        "matches": float(np.mean(tracks.matches)),
+        "dead_reckoning": errors(blind[good])
+        | {"diverged": int(np.sum(np.linalg.norm(blind[:, -1, :2], axis=-1) > 1.0))},
+    }
+
+
+def errors(error: np.ndarray) -> dict:
+    """RMSE of position [m] and heading [deg] over pose errors (..., 3)."""
+    return {
+        "position_rmse_m": float(np.sqrt(np.mean(np.sum(error[..., :2] ** 2, axis=-1)))),
+        "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(error[..., 2] ** 2)))),
+    }
+
+
+def collect(parts: Iterable[Track]) -> Track:
+    """All groups of runs as one."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

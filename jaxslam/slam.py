@@ -31,7 +31,8 @@ class Config(NamedTuple):
     kinds: tuple[int, ...] = (NODE, CORNER, WALL)  # landmarks the filter uses
     steps: int = 32  # of the automaton
     landmarks: int = 96  # L
-    fresh: int = 4  # new landmarks a scan at most
+    matches: int = 8  # landmarks that update the state in one scan at most
+    fresh: int = 4  # new landmarks in one scan at most
     gate: float = 9.21  # chi-square of 2 at 99 %
     margin: float = 4.0  # squared distance between the best match and the next
     far: float = 25.0  # squared distance from which a feature may be new
@@ -150,7 +151,12 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
     counts = before.seen.at[slot].get(mode="fill", fill_value=0) + 1 >= config.confirm
     used = (slot < size) & counts
-    rows = ekf.innovations(before, seen, r, jnp.where(used, slot, size))
+    # A few rows suffice: wall directions first, then as the front end ordered them.
+    urgency = jnp.where(used, jnp.where(seen.kind == WALL, 2, 1), 0)
+    order = jnp.argsort(-urgency, stable=True)[: config.matches]
+    used &= jnp.zeros_like(used).at[order].set(True)
+    some = jax.tree.map(lambda x: x[order], (seen, r, jnp.where(used, slot, size)))
+    rows = ekf.innovations(before, *some)
     after, nis, logdet = ekf.update(before, rows)
     finite = jnp.all(jnp.isfinite(after.mean)) & jnp.isfinite(nis)
     after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)

@@ -1,0 +1,137 @@
+"""What every experiment shares: its arguments, its two files, and pictures of cells."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import slam, voronoi, world
+from jaxslam.grid import GridSpec, centres
+from jaxslam.io.output import plain, write_json
+from jaxslam.lidar import Lidar, Scan, cast
+
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
+    *("#000000", "#E69F00", "#56B4E9", "#009E73"),
+    *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
+)
+"""The colours of Okabe and Ito, which colour-blind people can tell apart."""
+
+EMPTY, BRANCH = ".", "*"
+NAMES = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJ"  # of the labels, in the order of their bits
+
+Numbers = dict[str, Any]
+"""Results of an experiment: dicts, lists, numbers and strings."""
+
+GRID = GridSpec(ahead=7.95, behind=0.25, side=8.05)
+"""Grid whose cells have their centres on multiples of 0.1 m, where the worlds have their walls."""
+
+Window = tuple[float, float, float, float]
+"""Part of the robot frame: x from, x to, y from, y to [m]."""
+
+
+def parse(description: str | None, argv: list[str] | None = None, **extra: Any):
+    """Arguments of an experiment: --out, --seed and a flag for each of `extra`.
+
+    Args:
+        description: Docstring of the experiment.
+        argv: Arguments instead of those of the command line.
+        extra: Name and default of further flags.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the two files")
+    parser.add_argument("--seed", type=int, default=0, help="of all that is random")
+    for name, default in extra.items():
+        parser.add_argument(f"--{name}", type=type(default), default=default)
+    return parser.parse_args(argv)
+
+
+def save(out: Path, name: str, numbers: Numbers, draw: Callable[[Numbers, Path], None]) -> None:
+    """Write `name`.json, and `name`.png as drawn from what stands in it."""
+    numbers = plain(numbers)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / f"{name}.json", numbers)
+    draw(numbers, out / f"{name}.png")
+    print(f"wrote {out / name}.json and .png")
+
+
+def canvas(width: float, height: float, rows: int, columns: int, widths: list[int] | None = None):
+    """Figure of the given size [inch] and its axes (rows, columns), of relative `widths`."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, width_ratios=widths)
+
+
+def scan_of(name: str, lidar: Lidar) -> Scan:
+    """Noise-free scan of the world `name` from its origin."""
+    walls = jnp.asarray(world.named(name).walls, float)
+    return cast(world.World(walls), jnp.zeros(3), lidar)
+
+
+def look(name: str, mode: str) -> tuple[voronoi.Diagram, np.ndarray]:
+    """Diagram of the world `name` as seen from its origin, and its source cells (H, W)."""
+    config = slam.Config(labels=mode, grid=GRID)
+    _, diagram, sources = slam.look(config, scan_of(name, config.lidar))
+    return diagram, np.asarray(sources)
+
+
+def cut(cells: np.ndarray, window: Window) -> np.ndarray:
+    """Cells (H, W) whose centres lie in the window."""
+    x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
+    rows, columns = x[:, 0], y[0]
+    rows = (window[0] < rows) & (rows < window[1])
+    columns = (window[2] < columns) & (columns < window[3])
+    return np.asarray(cells)[np.ix_(rows, columns)]
+
+
+def text_of(labels: np.ndarray, branch: np.ndarray) -> list[str]:
+    """A line of text for each row of cells: its label's name, `*` for a branch, `.` for none."""
+    one = lambda label, met: (
+        BRANCH if met else NAMES[int(label).bit_length() - 1] if label else EMPTY
+    )
+    return [
+        "".join(one(*pair) for pair in zip(*row, strict=True))
+        for row in zip(labels.tolist(), branch.tolist(), strict=True)
+    ]
+
+
+def picture(diagram: voronoi.Diagram, sources: np.ndarray, window: Window) -> Numbers:
+    """Regions and branches, and sources, of a diagram as lines of text, x and y ascending."""
+    labels, branch = np.asarray(diagram.labels), np.asarray(voronoi.branches(diagram, sources))
+    regions, none = np.where(sources, 0, labels), np.zeros_like(sources)
+    seeds = np.where(sources, labels, 0)
+    return {
+        "window_m": window,
+        "diagram": text_of(cut(regions, window), cut(branch, window)),
+        "sources": text_of(cut(seeds, window), cut(none, window)),
+    }
+
+
+def colour(name: str, order: str) -> str:
+    """Colour of a label, by its place among the labels of the picture."""
+    return (SKY, ORANGE, GREEN, PINK, YELLOW, BLUE, RED)[order.index(name) % 7]
+
+
+def draw_picture(axis, drawn: Numbers) -> None:
+    """Draw what `picture` returns, as the robot sees it: x up, y to the left."""
+    from matplotlib.colors import to_rgb
+
+    lines, sources = drawn["diagram"], drawn["sources"]
+    order = "".join(sorted(set("".join(lines + sources)) - {EMPTY, BRANCH}))
+    image = np.ones((len(lines), len(lines[0]), 3))
+    for i, j in np.ndindex(*image.shape[:2]):
+        region, source = lines[i][j], sources[i][j]
+        if source != EMPTY:
+            image[i, j] = 0.75 * np.array(to_rgb(colour(source, order)))
+        elif region == BRANCH:
+            image[i, j] = to_rgb(BLACK)
+        elif region != EMPTY:
+            image[i, j] = 0.3 * np.array(to_rgb(colour(region, order))) + 0.7
+    low, high, right, left = drawn["window_m"]
+    axis.imshow(image, origin="lower", extent=(right, left, low, high), interpolation="none")
+    axis.plot(0, 0, "^", color=RED, markersize=8, clip_on=False)
+    axis.set(xlim=(left, right), ylim=(low, high), aspect="equal")
+    axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")

@@ -1,0 +1,113 @@
+"""Fig. 4 of the paper: edge codes of a box, and the diagram around it in both label modes."""
+
+from pathlib import Path
+
+import numpy as np
+
+from experiments.common import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GRID,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    Numbers,
+    canvas,
+    cut,
+    draw_picture,
+    look,
+    parse,
+    picture,
+    save,
+    scan_of,
+)
+from jaxslam.edges import codes
+from jaxslam.grid import centres, rasterise
+from jaxslam.lidar import Lidar
+from jaxslam.voronoi import block_union, branches
+
+WINDOW = (-0.25, 3.25, -2.25, 2.25)
+FRONT = (1.35, 1.45, 0.45, 0.85)  # the face of the box across the sensor axis
+SIDE = (1.55, 1.95, 0.25, 0.35)  # and the one along it, both without their common corner
+CORNER = (1.4, 0.3)  # where they meet
+COLOURS = {1: BLACK, 2: ORANGE, 3: SKY, 4: GREEN, 5: BLUE, 6: PINK}
+
+
+def labels_of(face: tuple[float, ...], labels: np.ndarray) -> int:
+    """Union of the label bits of the sources on a face."""
+    return int(np.bitwise_or.reduce(cut(labels, face), axis=None))
+
+
+def between_faces(diagram, sources: np.ndarray) -> Numbers:
+    """The branch that parts the region of the front face from that of the side face."""
+    labels = np.asarray(diagram.labels)
+    starts = np.where(sources, labels, 0)
+    front, side = labels_of(FRONT, starts), labels_of(SIDE, starts)
+    near = np.asarray(block_union(np.where(sources, 0, labels)))
+    branch = np.asarray(branches(diagram, sources)) & (near & front != 0) & (near & side != 0)
+    away = np.asarray(centres(GRID))[branch] - np.array(CORNER)
+    gap = np.hypot(*away.T)
+    close = gap < 1.0  # further away the branch may part other walls with the same labels
+    return {
+        "faces_differ": bool(front & side == 0 and front != 0 and side != 0),
+        "cells": int(close.sum()),
+        "nearest_m": round(float(gap.min(initial=np.inf)), 3),
+        "furthest_m": round(float(gap[close].max(initial=0.0)), 3),
+        "holds": bool(front & side == 0 and close.sum() >= 4 and gap.min(initial=np.inf) < 0.2),
+    }
+
+
+def compute() -> Numbers:
+    """Codes of the cells, and in each mode the diagram and the branch between the faces."""
+    lidar = Lidar()
+    code = codes(rasterise(scan_of("fig04", lidar), lidar, GRID), GRID)
+    seen = {mode: look("fig04", mode) for mode in ("codes", "runs")}
+    digits = lambda row: "".join(str(c) if c else "." for c in row)
+    return {
+        "window_m": WINDOW,
+        "codes": [digits(row) for row in cut(code, WINDOW).tolist()],
+        "branch_between_faces": {mode: between_faces(*pair) for mode, pair in seen.items()},
+        "pictures": {mode: picture(*pair, WINDOW) for mode, pair in seen.items()},
+    }
+
+
+def draw_codes(axis, lines: list[str], window: list[float]) -> None:
+    """Draw the edge codes, each with its number."""
+    low, high, right, left = window
+    height, width = (high - low) / len(lines), (left - right) / len(lines[0])
+    for code, colour in COLOURS.items():
+        cells = [
+            (i, j) for i, line in enumerate(lines) for j, c in enumerate(line) if c == str(code)
+        ]
+        for i, j in cells:
+            x, y = low + i * height, right + j * width
+            axis.fill([y, y + width, y + width, y], [x, x, x + height, x + height], color=colour)
+        if cells:
+            axis.fill([], [], color=colour, label=f"e{code}")
+    axis.legend(loc="center", fontsize=9)
+    axis.plot(0, 0, "^", color=RED, markersize=8, clip_on=False)
+    axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", title="edge codes")
+    axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")
+
+
+def draw(numbers: Numbers, path: Path) -> None:
+    """Draw the codes and both diagrams."""
+    figure, axes = canvas(9.4, 3.2, 1, 3)
+    draw_codes(axes[0, 0], numbers["codes"], numbers["window_m"])
+    for axis, mode in zip(axes[0, 1:], ("codes", "runs"), strict=True):
+        draw_picture(axis, numbers["pictures"][mode])
+        axis.set_title(f"diagram, labels: {mode}")
+        axis.label_outer()
+    figure.savefig(path)
+
+
+def main() -> None:
+    """Run the experiment."""
+    given = parse(__doc__)
+    save(given.out, "fig04_object", compute(), draw)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import edges, lidar, world
+from jaxslam.edges import RunSpec, code_bits, codes
+from jaxslam.geometry import to_robot
+from jaxslam.grid import Grid, GridSpec, cell_of
+from jaxslam.lidar import Lidar, Scan, points
+from jaxslam.world import World
+
+runs = jax.jit(edges.runs, static_argnums=(1, 2))
+run_bits = jax.jit(edges.run_bits, static_argnums=(1, 3))
+cast = jax.jit(lidar.cast, static_argnums=2)
+
+SCANNER, SPEC = Lidar(), RunSpec()
+TINY = GridSpec(cell=0.1, ahead=0.5, behind=0.0, side=0.5)  # the axis is between columns 4 and 5
+RIGHT, LEFT = (2, 2), (2, 7)  # cells on the clockwise and on the other side of the axis
+TURN = {1: (1, 0), 2: (0, -1), 4: (-1, 0), 8: (0, 1)}  # N E S W: x is ahead, y to the left
+
+# Code on the clockwise side of the axis and on the other, of each pattern N=1 E=2 S=4 W=8.
+PATTERNS = {
+    0b0000: (1, 1),  # alone: noise
+    0b1111: (0, 0),  # inside
+    0b1011: (2, 2),
+    0b1010: (2, 2),
+    0b0010: (2, 2),
+    0b1000: (2, 2),
+    0b0111: (3, 3),
+    0b1101: (4, 4),
+    0b0101: (3, 4),  # a line along the axis, and its ends
+    0b0001: (3, 4),
+    0b0100: (3, 4),
+    0b0011: (5, 5),
+    0b1001: (6, 6),
+    0b1110: (2, 2),  # these three face away and count as what they mirror
+    0b0110: (5, 5),
+    0b1100: (6, 6),
+}
+
+
+def drawn(cell, pattern):
+    """Grid with one occupied cell that has the given pattern of neighbours."""
+    occupied = np.zeros(TINY.shape, bool)
+    occupied[cell] = True
+    for bit, (di, dj) in TURN.items():
+        occupied[cell[0] + di, cell[1] + dj] = bool(pattern & bit)
+    return Grid(occupied=jnp.asarray(occupied), free=jnp.asarray(~occupied))
+
+
+def seen(walls, pose, scanner=SCANNER):
+    """Noise-free scan of walls (S, 4) from a pose, and its runs."""
+    scan = cast(World(jnp.asarray(walls)), jnp.asarray(pose, float), scanner)
+    return scan, runs(scan, scanner, SPEC)
+
+
+def comb(chunks):
+    """Scan in which the range jumps after each of the given numbers of beams."""
+    ranges = np.concatenate([np.full(n, 2.0 + 2.0 * (k % 2)) for k, n in enumerate(chunks)])
+    scanner = Lidar(beams=len(ranges), step=math.pi / 360, first=-1.8)
+    return Scan(ranges=jnp.asarray(ranges), hit=jnp.ones(len(ranges), bool)), scanner
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("side", [0, 1])
+def test_code_of_each_pattern(side, pattern):
+    cell = (RIGHT, LEFT)[side]
+    assert codes(drawn(cell, pattern), TINY)[cell] == PATTERNS[pattern][side]
+
+
+def test_empty_cells_have_no_code():
+    grid = drawn(RIGHT, 15)
+    assert not codes(grid, TINY)[~grid.occupied].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mirroring_the_scan_swaps_the_codes_of_left_and_right(seed):
+    occupied = np.random.default_rng(seed).random(TINY.shape) < 0.5
+    here, there = (
+        np.asarray(codes(Grid(jnp.asarray(o), jnp.asarray(~o)), TINY))
+        for o in (occupied, occupied[:, ::-1])
+    )
+    swapped = np.array([0, 1, 2, 4, 3, 6, 5], np.uint8)[here]
+    np.testing.assert_array_equal(there[:, ::-1], swapped)
+    assert set(here.ravel()) == set(range(7))
+
+
+def test_every_code_but_noise_starts_a_label_of_its_own():
+    bits = np.asarray(code_bits(jnp.arange(7, dtype=jnp.uint8)))
+    assert bits.dtype == np.uint8
+    np.testing.assert_array_equal(bits, [0, 0, 1, 2, 4, 8, 16])
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (0.7, -0.3, 0.25), (0.6, 0.9, -0.3)])
+def test_a_room_gives_exactly_its_visible_walls(pose):
+    corners = np.array([[-1.0, -2.0], [3.0, -2.0], [3.0, 2.0], [-1.0, 2.0]])
+    _, found = seen(world.outline([(-1.0, -2.0, 3.0, 2.0)]), pose)
+    at = np.asarray(to_robot(jnp.asarray(pose), jnp.asarray(corners)))
+    ends, normal, centre = (np.asarray(x)[:3] for x in (found.ends, found.normal, found.centre))
+    np.testing.assert_array_equal(found.valid, np.arange(SPEC.capacity) < 3)
+    for k in range(3):  # right, ahead, left
+        off = (at[k : k + 2] - centre[k]) @ normal[k]
+        np.testing.assert_allclose(off, 0.0, atol=1e-9)
+    assert np.all(np.sum(normal * -centre, axis=1) > 0)  # the robot is on the positive side
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_array_equal(found.meets[:4], [True, True, False, False])
+    np.testing.assert_allclose(ends[:2, 1], at[1:3], atol=1e-9)
+    np.testing.assert_allclose(ends[1:, 0], at[1:3], atol=1e-9)
+    assert found.real[:3].tolist() == [[False, True], [True, True], [True, False]]
+
+
+@pytest.mark.parametrize("heading", np.linspace(-0.6, 0.6, 7).round(2))
+def test_a_straight_wall_is_one_run_whatever_its_direction(heading):
+    scan, found = seen([[2.0, -9.0, 2.0, 9.0]], (0.0, 0.0, heading))
+    assert found.valid.sum() == 1
+    assert np.unique(np.asarray(found.of_beam)[np.asarray(scan.hit)]).tolist() == [0]
+    np.testing.assert_allclose(found.normal[0], [-math.cos(heading), math.sin(heading)], atol=1e-9)
+
+
+def test_beams_of_a_run_lie_on_its_line():
+    scan, found = seen(world.named("office").walls, (8.1, 5.03, 1.9))
+    of, valid = np.asarray(found.of_beam), np.asarray(found.valid)
+    owned = (of < SPEC.capacity) & valid[np.minimum(of, SPEC.capacity - 1)]
+    k = of[owned]
+    off = np.asarray(points(scan, SCANNER))[owned] - np.asarray(found.centre)[k]
+    off = np.abs(np.sum(off * np.asarray(found.normal)[k], axis=1))
+    assert off.max() < SPEC.bend and np.median(off) < 1e-9
+    assert valid.sum() > 5
+
+
+def test_the_line_fit_is_as_uncertain_as_it_says():
+    """Mean square errors are within 4 standard errors of the variances that are claimed."""
+    count = 1000
+    scanner = Lidar(beams=81, first=-math.pi / 9, step=math.pi / 360, noise=0.01)
+    clean = cast(World(jnp.array([[2.0, -9.0, 2.0, 9.0]])), jnp.zeros(3), scanner)
+    places = jnp.array([-0.6, 0.0, 0.6])  # [m] along the wall, from its middle
+
+    @jax.jit
+    @jax.vmap
+    def trial(key):
+        found = edges.runs(lidar.disturb(key, clean, scanner), scanner, SPEC)
+        line = jax.tree.map(lambda x: x[0], found._replace(of_beam=found.of_beam[:1]))
+        at = jnp.stack([jnp.full(3, 2.0), places], axis=-1) - line.centre[None]
+        along = at @ jnp.stack([line.normal[1], -line.normal[0]])
+        return at @ line.normal, line.line_variance(along), found.valid.sum(), line.weight
+
+    error, claimed, number, weight = trial(jax.random.split(jax.random.key(0), count))
+    alone = np.asarray(number) == 1
+    assert alone.mean() > 0.95 and np.all(weight[alone] == scanner.beams - 4)
+    ratio = np.mean(error[alone] ** 2, axis=0) / np.mean(claimed[alone], axis=0)
+    np.testing.assert_allclose(ratio, 1.0, atol=4 * math.sqrt(2 / alone.sum()))
+    bias = np.abs(np.mean(error[alone], axis=0)) / np.std(error[alone], axis=0)
+    assert np.all(bias < 4 / math.sqrt(alone.sum()))
+
+
+def test_more_stretches_than_runs_share_the_last_label():
+    chunks = [5 + k % 4 for k in range(SPEC.capacity + 20)]
+    scan, scanner = comb(chunks)
+    found = runs(scan, scanner, SPEC)
+    of = np.asarray(found.of_beam)
+    stretch = np.repeat(np.arange(len(chunks)), chunks)
+    last = SPEC.capacity - 1
+    # Every beam that hit has a label, and all but the last label belong to one stretch each.
+    assert of.max() == last
+    owner = {k: set(stretch[of == k]) for k in range(SPEC.capacity)}
+    assert all(len(owner[k]) == 1 for k in range(last)) and len(owner[last]) == 21
+    # The longest stretches have their own.
+    own = [chunks[next(iter(owner[k]))] for k in range(last)]
+    assert min(own) >= max(chunks[k] for k in owner[last])
+    assert np.array_equal(np.sort(np.unique(of[of < last])), np.arange(last))
+    assert not found.valid[last]  # no line goes through all that share it
+
+
+def test_every_hit_starts_its_label_even_when_labels_are_shared():
+    scan, scanner = comb([5 + k % 4 for k in range(SPEC.capacity + 20)])
+    found = runs(scan, scanner, SPEC)
+    spec = GridSpec(ahead=5.0, behind=5.0, side=5.0)
+    bits = np.asarray(run_bits(scan, scanner, found, spec))
+    at = np.asarray(cell_of(points(scan, scanner), spec))
+    label = np.uint32(1) << np.asarray(found.of_beam).astype(np.uint32)
+    assert (bits[tuple(at.T)] != 0).all()
+    # A cell may hold the labels of two runs that meet in it, and three at most lose one.
+    assert np.mean(bits[tuple(at.T)] & label != 0) > 0.95
+    assert bits.dtype == np.uint32 and bits.max() < 2**SPEC.capacity
+
+
+def test_beams_that_hit_nothing_start_no_label():
+    nothing = Scan(ranges=jnp.full(361, 10.0), hit=jnp.zeros(361, bool))
+    found = runs(nothing, SCANNER, SPEC)
+    assert not found.valid.any() and np.all(found.of_beam == SPEC.capacity)
+    assert not run_bits(nothing, SCANNER, found, GridSpec()).any()
+
+
+def test_labels_of_a_run_have_no_gaps():
+    scan, found = seen([[0.5, 0.5, 6.0, 0.5]], (0.0, 0.0, 0.0))  # grazing: hits far apart
+    bits = np.asarray(run_bits(scan, SCANNER, found, GridSpec()))
+    rows = np.flatnonzero((bits != 0).any(axis=1))
+    assert np.all(np.diff(rows) == 1) and rows[-1] - rows[0] > 50
+    assert set(bits[bits != 0]) == {1}

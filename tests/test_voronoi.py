@@ -1,0 +1,182 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scipy.ndimage import distance_transform_cdt
+
+from jaxslam.voronoi import branches, expand, junctions
+
+STEPS = 60  # more than any front needs on the grids below
+SEEDS = range(4)
+
+# Fig. 2 of the paper: arrival and label of each cell after three steps; blank where no front has
+# arrived and where fronts met. The upper three rows; the others mirror them.
+ONE = [
+    "      3,1   2,1   3,1       ",
+    "3,1   2,1   1,1   2,1   3,1 ",
+    "2,1   1,1   0,1   1,1   2,1 ",
+]
+TWO = [
+    "      3,1   2,1   3,1         3,2   2,2   3,2       ",
+    "3,1   2,1   1,1   2,1         2,2   1,2   2,2   3,2 ",
+    "2,1   1,1   0,1   1,1         1,2   0,2   1,2   2,2 ",
+]
+
+
+def random_grid(seed, shape=(20, 27), labels=5, walls=0.15, dtype=np.uint8):
+    """Sources of a few labels, and closed cells, strewn over a grid."""
+    random = np.random.default_rng(seed)
+    sources = random.random(shape) < 0.04
+    bits = np.where(sources, 1 << random.integers(0, labels, shape), 0).astype(dtype)
+    return bits, random.random(shape) > walls
+
+
+def grown(bits, open, steps=STEPS):
+    return jax.tree.map(np.asarray, expand(jnp.asarray(bits), jnp.asarray(open), steps=steps))
+
+
+def permuted(bits, order):
+    """The same sets with label k renamed order[k]."""
+    parts = [((bits >> k) & 1) << order[k] for k in range(len(order))]
+    return np.bitwise_or.reduce(parts).astype(bits.dtype)
+
+
+def cells_of(rows, width):
+    """Table of a figure as (text of) cells, its lower half mirrored from the upper."""
+    rows = [[row[6 * k : 6 * k + 6].strip() for k in range(width)] for row in rows]
+    return rows + rows[-2::-1]
+
+
+def printed(diagram):
+    """What the figure prints of each cell: arrival and label, or nothing."""
+    text = lambda t, v: f"{t},{v}" if reference.bits(v) == 1 else ""
+    pairs = zip(diagram.arrival.tolist(), diagram.labels.tolist(), strict=True)
+    return [[text(t, v) for t, v in zip(*row, strict=True)] for row in pairs]
+
+
+def test_one_source_grows_as_figure_2a():
+    bits = np.zeros((5, 5), np.uint8)
+    bits[2, 2] = 1
+    assert printed(grown(bits, bits == 0, steps=3)) == cells_of(ONE, 5)
+
+
+def test_two_sources_meet_as_in_figure_2b():
+    bits = np.zeros((5, 9), np.uint8)
+    bits[2, 2], bits[2, 6] = 1, 2
+    diagram = grown(bits, bits == 0, steps=3)
+    assert printed(diagram) == cells_of(TWO, 9)
+    np.testing.assert_array_equal(diagram.labels[:, 4], [0, 3, 3, 3, 0])
+    np.testing.assert_array_equal(diagram.arrival[:, 4], [-1, 3, 2, 3, -1])
+    later = grown(bits, bits == 0, steps=4)
+    np.testing.assert_array_equal(later.labels[:, 4], 3)
+    np.testing.assert_array_equal(later.arrival[:, 4], [4, 3, 2, 3, 4])
+    np.testing.assert_array_equal(branches(later, bits != 0), np.arange(9) == np.full((5, 1), 4))
+
+
+@pytest.mark.parametrize("steps", [0, 1, 5, STEPS])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_expand_agrees_with_breadth_first_search(seed, steps):
+    bits, open = random_grid(seed)
+    diagram = grown(bits, open, steps)
+    labels, arrival = reference.expand(bits, open, steps)
+    np.testing.assert_array_equal(diagram.labels, labels)
+    np.testing.assert_array_equal(diagram.arrival, arrival)
+    assert reference.bits(diagram.labels.max()) > 1 or steps < 5  # fronts did meet
+
+
+@pytest.mark.parametrize("dtype, labels", [(np.uint8, 7), (np.uint16, 15), (np.uint32, 31)])
+def test_every_label_that_fits_expands(dtype, labels):
+    bits, open = random_grid(7, dtype=dtype, shape=(30, 30))
+    bits[bits != 0] = 1 << (np.arange(np.count_nonzero(bits)) % labels)
+    diagram = grown(bits, open)
+    assert diagram.labels.dtype == dtype
+    assert np.bitwise_or.reduce(diagram.labels, axis=None) == 2**labels - 1
+    np.testing.assert_array_equal(diagram.labels, reference.expand(bits, open, STEPS)[0])
+
+
+def test_sources_of_two_labels_pass_nothing_on():
+    bits = np.zeros((3, 7), np.uint8)
+    bits[1, 3] = 5
+    diagram = grown(bits, bits == 0)
+    np.testing.assert_array_equal(diagram.labels, bits)
+    np.testing.assert_array_equal(diagram.arrival, np.where(bits != 0, 0, -1))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_arrival_is_the_manhattan_distance_to_the_nearest_source(seed):
+    bits, _ = random_grid(seed)
+    arrival = grown(bits, np.ones(bits.shape, bool)).arrival
+    distance = distance_transform_cdt(bits == 0, metric="taxicab")
+    reached = arrival >= 0
+    np.testing.assert_array_equal(arrival[reached], distance[reached])
+    assert reached.mean() > 0.9
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("turn", [np.rot90, np.flipud, np.fliplr, np.transpose])
+def test_expand_turns_and_mirrors_with_the_grid(turn, seed):
+    bits, open = random_grid(seed)
+    before, after = grown(bits, open), grown(turn(bits), turn(open))
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, turn(b)), after, before)
+    found = junctions(before, bits != 0)
+    np.testing.assert_array_equal(junctions(after, turn(bits) != 0), turn(found))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_names_of_the_labels_do_not_matter(seed):
+    bits, open = random_grid(seed)
+    order = np.random.default_rng(seed + 100).permutation(5)
+    before, after = grown(bits, open), grown(permuted(bits, order), open)
+    np.testing.assert_array_equal(after.labels, permuted(before.labels, order))
+    np.testing.assert_array_equal(after.arrival, before.arrival)
+    found = junctions(before, bits != 0)
+    np.testing.assert_array_equal(junctions(after, bits != 0), found)
+    assert found.any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_closed_cells_never_change_and_padding_is_invisible(seed):
+    bits, open = random_grid(seed)
+    diagram = grown(bits, open)
+    shut = ~open & (bits == 0)
+    assert not diagram.labels[shut].any() and (diagram.arrival[shut] == -1).all()
+    padded = grown(np.pad(bits, 3), np.pad(open, 3))
+    inner = jax.tree.map(lambda x: x[3:-3, 3:-3], padded)
+    jax.tree.map(np.testing.assert_array_equal, inner, diagram)
+    assert padded.labels.astype(bool).sum() == diagram.labels.astype(bool).sum()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_two_regions_are_parted_by_branches(seed):
+    bits, open = random_grid(seed)
+    diagram, sources = grown(bits, open), bits != 0
+    branch = np.asarray(branches(diagram, sources))
+    assert not reference.unseparated(diagram.labels, branch, sources)
+    assert reference.unseparated(diagram.labels, np.zeros_like(branch), sources)  # they do meet
+    assert not branch[sources | (diagram.labels == 0)].any()
+
+
+def test_an_even_meet_is_marked_on_one_side_only():
+    bits = np.zeros((1, 6), np.uint8)
+    bits[0, 0], bits[0, 5] = 2, 1
+    diagram = grown(bits, bits == 0)
+    np.testing.assert_array_equal(diagram.labels, [[2, 2, 2, 1, 1, 1]])
+    np.testing.assert_array_equal(branches(diagram, bits != 0), [[0, 0, 0, 1, 0, 0]])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_junctions_are_where_three_labels_are_near(seed):
+    bits, open = random_grid(seed)
+    diagram = grown(bits, open)
+    expected = reference.junctions(diagram.labels, bits != 0)
+    np.testing.assert_array_equal(junctions(diagram, bits != 0), expected)
+    assert 0 < expected.sum() < expected.size / 2
+
+
+def test_expand_batches():
+    bits, open = (np.stack(x) for x in zip(*map(random_grid, SEEDS), strict=True))
+    together = jax.vmap(lambda b, o: expand(b, o, steps=STEPS))(bits, open)
+    for k in SEEDS:
+        alone = grown(bits[k], open[k])
+        jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), together, alone)

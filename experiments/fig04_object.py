@@ -31,7 +31,7 @@ from jaxslam.voronoi import block_union, branches
 WINDOW = (-0.25, 3.25, -2.25, 2.25)
 FRONT = (1.35, 1.45, 0.45, 0.85)  # the face of the box across the sensor axis
 SIDE = (1.55, 1.95, 0.25, 0.35)  # and the one along it, both without their common corner
-CORNER = (1.4, 0.3)  # where they meet
+CORNER = (1.35, 1.45, 0.25, 0.35)  # where they meet
 COLOURS = {1: BLACK, 2: ORANGE, 3: SKY, 4: GREEN, 5: BLUE, 6: PINK}
 
 
@@ -41,21 +41,27 @@ def labels_of(face: tuple[float, ...], labels: np.ndarray) -> int:
 
 
 def between_faces(diagram, sources: np.ndarray) -> Numbers:
-    """The branch that parts the region of the front face from that of the side face."""
+    """Branch cells within 1 m of the box that part the regions of its two faces.
+
+    Edge codes give the corner of the box a label of its own, so that there the faces are parted
+    by the region of the corner, with a branch on either side.
+    """
     labels = np.asarray(diagram.labels)
     starts = np.where(sources, labels, 0)
-    front, side = labels_of(FRONT, starts), labels_of(SIDE, starts)
+    front, side, corner = (labels_of(part, starts) for part in (FRONT, SIDE, CORNER))
+    corner &= ~(front | side)
     near = np.asarray(block_union(np.where(sources, 0, labels)))
-    branch = np.asarray(branches(diagram, sources)) & (near & front != 0) & (near & side != 0)
-    away = np.asarray(centres(GRID))[branch] - np.array(CORNER)
-    gap = np.hypot(*away.T)
-    close = gap < 1.0  # further away the branch may part other walls with the same labels
+    x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
+    close = np.hypot(x - CORNER[0] - 0.05, y - CORNER[2] - 0.05) < 1.0
+    branch = np.asarray(branches(diagram, sources)) & close
+    touching = lambda *parts: int((branch & np.all([near & p != 0 for p in parts], axis=0)).sum())
+    direct, first, second = touching(front, side), touching(front, corner), touching(corner, side)
     return {
-        "faces_differ": bool(front & side == 0 and front != 0 and side != 0),
-        "cells": int(close.sum()),
-        "nearest_m": round(float(gap.min(initial=np.inf)), 3),
-        "furthest_m": round(float(gap[close].max(initial=0.0)), 3),
-        "holds": bool(front & side == 0 and close.sum() >= 4 and gap.min(initial=np.inf) < 0.2),
+        "faces_differ": front & side == 0 and front != 0 and side != 0,
+        "between_faces_cells": direct,
+        "front_and_corner_cells": first,
+        "corner_and_side_cells": second,
+        "holds": front & side == 0 and (direct >= 4 or min(first, second) >= 4),
     }
 
 
@@ -86,7 +92,7 @@ def draw_codes(axis, lines: list[str], window: list[float]) -> None:
             axis.fill([y, y + width, y + width, y], [x, x, x + height, x + height], color=colour)
         if cells:
             axis.fill([], [], color=colour, label=f"e{code}")
-    axis.legend(loc="center", fontsize=9)
+    axis.legend(loc="center right", fontsize=9)
     axis.plot(0, 0, "^", color=RED, markersize=8, clip_on=False)
     axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", title="edge codes")
     axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")

@@ -31,20 +31,19 @@ def measure(diagram, sources: np.ndarray) -> Numbers:
     x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
     inside = (x > MEASURED[0]) & (x < MEASURED[1]) & (np.abs(y) < HALF)
     branch = np.asarray(branches(diagram, sources)) & inside
-    profile, at = [], 0.0
+    profile, at, beside = [], 0.0, 0
     for row in np.flatnonzero(branch.any(axis=1)):
         cells = y[row, branch[row]]
         at = cells[np.argmin(np.abs(cells - at))]
+        beside += int(np.sum(np.abs(cells - at) > 1.5 * CELL))
         profile.append([x[row, 0], at])
     line = np.array(profile)
-    middle = dict(zip(line[:, 0].round(2).tolist(), line[:, 1].tolist(), strict=True))
-    near = np.abs(y - np.vectorize(lambda v: middle.get(round(float(v), 2), np.inf))(x))
     return {
         "offset_m": line.round(3),
         "largest_offset_m": round(float(np.abs(line[:, 1]).max()), 3),
         "rows_without_branch": int((inside.any(axis=1) & ~branch.any(axis=1)).sum()),
         "pieces": int(label(branch, np.ones((3, 3)))[1]),
-        "side_branch_cells": int((branch & (near > 1.5 * CELL)).sum()),
+        "side_branch_cells": beside,
         "junctions": int(
             label(np.asarray(junctions(diagram, sources)) & inside, np.ones((3, 3)))[1]
         ),

@@ -6,13 +6,12 @@ straight wall, found in the order of the beams, with its line fit.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.geometry import cross, dot, unit
 from jaxslam.grid import Grid, GridSpec, cell_of, centres
-from jaxslam.lidar import Lidar, Scan, bearings, points
+from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.types import Array
 from jaxslam.voronoi import around
 
@@ -171,8 +170,10 @@ def _fit(xy: Array, member: Array, noise: float) -> tuple[Array, ...]:
     weight = jnp.maximum(w.sum(axis=1), 1.0)
     centre = (w @ xy) / weight[:, None]
     d = (xy[None] - centre[:, None]) * w[:, :, None]
-    xx, yy, xy_ = jnp.sum(d[..., 0] ** 2, 1), jnp.sum(d[..., 1] ** 2, 1), jnp.sum(
-        d[..., 0] * d[..., 1], 1
+    xx, yy, xy_ = (
+        jnp.sum(d[..., 0] ** 2, 1),
+        jnp.sum(d[..., 1] ** 2, 1),
+        jnp.sum(d[..., 0] * d[..., 1], 1),
     )
     flat = (jnp.abs(xy_) < 1e-9) & (jnp.abs(xx - yy) < 1e-9)
     angle = 0.5 * jnp.arctan2(jnp.where(flat, 0.0, 2 * xy_), jnp.where(flat, 1.0, xx - yy))

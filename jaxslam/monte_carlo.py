@@ -4,10 +4,10 @@ The only module, beside `fit`, in which arrays lead with B, the runs.
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +16,15 @@ from jax import lax
 
 from jaxslam import lidar, motion, plan, slam
 from jaxslam.geometry import compose
+from jaxslam.lidar import Scan
 from jaxslam.metrics import nees, pose_error
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
-from jaxslam.slam import Config, Inputs, Noise
+from jaxslam.slam import Config, Inputs, Noise, Survey, map_batches
 from jaxslam.types import Array, Key
 from jaxslam.world import World
 
 SUBSTEPS = 4  # parts in which the wheels' noise is drawn between two scans
-SCANS = 16  # scans of a run that are looked at together
 RUNS = 4  # runs that are filtered together
 
 
@@ -46,24 +46,6 @@ class Track(NamedTuple):
     matches: Array  # (T,) int32 features that updated the state
     landmarks: Array  # () int32 landmarks that count at the end
     finite: Array  # () bool
-
-
-def map_batches(function: Callable, items: Any, *, size: int) -> Any:
-    """Map `function` over the leading axis of `items`, `size` of them vectorised at a time.
-
-    The last batch is filled up with the last item: unlike `lax.map(batch_size=...)` this compiles
-    the function once.
-    """
-    count = jax.tree.leaves(items)[0].shape[0]
-    size = min(size, count)
-    pad = -count % size
-
-    def fold(x: Array) -> Array:
-        x = jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x
-        return x.reshape((-1, size) + x.shape[1:])
-
-    result = lax.map(jax.vmap(function), jax.tree.map(fold, items))
-    return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:])[:count], result)
 
 
 def start(path: Array) -> Array:
@@ -104,16 +86,45 @@ def simulate_one(
     key: Key, config: Config, world: World, robot: Robot, path: Array, *, steps: int
 ) -> Log:
     """Drive once along `path` (N, 2) and look at the world `steps` times."""
-    drive_key, scan_key = jax.random.split(key)
-    truth, told = drive(drive_key, robot, path, steps=steps)
+    truth, told, scan_keys = _drive(key, robot, path, steps=steps)
 
     def look(now: tuple[Array, Key]) -> Nodes:
-        pose, scan_key = now
-        scan = lidar.cast(world, pose, config.lidar)
-        return slam.front_end(config, lidar.disturb(scan_key, scan, config.lidar))
+        return slam.front_end(config, _scan(config, world, *now))
 
-    seen = map_batches(look, (truth, jax.random.split(scan_key, steps)), size=SCANS)
+    seen = map_batches(look, (truth, scan_keys), size=slam.BATCH)
     return Log(truth=truth, motion=told, nodes=seen)
+
+
+def _drive(key: Key, robot: Robot, path: Array, *, steps: int) -> tuple[Array, Array, Key]:
+    drive_key, scan_key = jax.random.split(key)
+    return *drive(drive_key, robot, path, steps=steps), jax.random.split(scan_key, steps)
+
+
+def _scan(config: Config, world: World, pose: Array, key: Key) -> Scan:
+    return lidar.disturb(key, lidar.cast(world, pose, config.lidar), config.lidar)
+
+
+def replay(
+    key: Key,
+    config: Config,
+    noise: Noise,
+    world: World,
+    robot: Robot,
+    path: Array,
+    *,
+    run: int,
+    steps: int,
+) -> tuple[Array, Survey]:
+    """Simulate one run of an experiment again and map it: its true poses (T, 3) and its survey."""
+    own = run_keys(key, jnp.array([run]))[0]
+
+    @jax.jit
+    def simulate_scans(own: Key) -> tuple[Array, Array, Scan]:
+        truth, told, scan_keys = _drive(own, robot, path, steps=steps)
+        return truth, told, lax.map(lambda now: _scan(config, world, *now), (truth, scan_keys))
+
+    truth, told, scans = simulate_scans(own)
+    return truth, slam.survey(config, noise, truth[0], told, scans)
 
 
 @partial(jax.jit, static_argnames=("config", "robot", "steps"))

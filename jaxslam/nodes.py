@@ -13,10 +13,13 @@ import numpy as np
 from jax import lax
 
 from jaxslam.edges import Runs
-from jaxslam.geometry import cross, dot, wrap_angle, wrap_line
-from jaxslam.grid import GridSpec, centre_of, corner
+from jaxslam.geometry import cross, dot, unit, wrap_angle, wrap_line
+from jaxslam.grid import GridSpec, centre_of, centres, corner
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.types import CORNER, NODE, WALL, Array
+from jaxslam.voronoi import Diagram, around, block_union, branches, expand, single
+
+LINK_STEPS = 60  # steps that the ids of two junctions take to meet at most
 
 
 class Nodes(NamedTuple):
@@ -31,6 +34,15 @@ class Nodes(NamedTuple):
     degree: Array  # (M,) int32 number of walls the circle of a node touches
     certified: Array  # (M,) bool, nothing unseen inside the circle of a node
     valid: Array  # (M,) bool, False marks padding
+
+
+class Links(NamedTuple):
+    """Branches of one diagram that join two of its junctions, padded to P; robot frame."""
+
+    pair: Array  # (P, 2) int32 indices of the features they join
+    via: Array  # (P, 2) [m] a point half-way
+    clearance: Array  # (P,) [m] the smaller of that point and of both ends
+    valid: Array  # (P,) bool
 
 
 class NodeSpec(NamedTuple):
@@ -66,15 +78,17 @@ class Feet(NamedTuple):
 def feet(place: Array, runs: Runs) -> Feet:
     """Feet of all runs seen from `place` (2,) [m, robot frame]."""
     line = runs.along
-    along = dot(place - runs.centre, line)
+    along = dot(place[None] - runs.centre, line)
     low = dot(runs.ends[:, 0] - runs.centre, line)
     high = dot(runs.ends[:, 1] - runs.centre, line)
     end = jnp.where(along < low, 0, jnp.where(along > high, 1, 2))
     inside = runs.centre + along[:, None] * line
     foot = jnp.where(
-        (end == 2)[:, None], inside, jnp.where((end == 0)[:, None], runs.ends[:, 0], runs.ends[:, 1])
+        (end == 2)[:, None],
+        inside,
+        jnp.where((end == 0)[:, None], runs.ends[:, 0], runs.ends[:, 1]),
     )
-    offset = foot - place
+    offset = foot - place[None]
     near = jnp.sum(offset**2, axis=1) < 1e-8
     distance = jnp.sqrt(jnp.where(near, 1e-8, jnp.sum(offset**2, axis=1)))
     toward = jnp.where(near[:, None], runs.normal, offset / distance[:, None])
@@ -140,7 +154,7 @@ def tangent_circle(place: Array, runs: Runs, spec: NodeSpec) -> Circle:
     return Circle(
         centre=centre,
         radius=radius,
-        cov=(gain * jnp.where(touched, variance, 0.0)) @ gain.T,
+        cov=(gain * jnp.where(touched, variance, 0.0)[None]) @ gain.T,
         error=jnp.max(jnp.where(touched, jnp.abs(f.distance - radius), 0.0)),
         spread=_spread(f.toward, touched),
         touched=touched,
@@ -162,7 +176,7 @@ def _spread(toward: Array, touched: Array) -> Array:
 def _peaks(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
     """Places (count, 2) [m] of groups of cells (H, W) bool, the nearest to the robot first.
 
-    Of the marked cells that lie within two or three cells of each other, the nearest stands for all.
+    Of marked cells within two or three cells of each other, the nearest stands for all.
     """
     h, w = cells.shape
     away = np.hypot(*((np.indices(spec.shape) + 0.5) * spec.cell + corner(spec)[:, None, None]))
@@ -194,7 +208,7 @@ def _rim_seen(circle: Circle, scan: Scan, lidar: Lidar) -> Array:
     rim; half a cell of slack for where it touches the walls.
     """
     turn = jnp.linspace(-jnp.pi, jnp.pi, 24, endpoint=False, dtype=scan.ranges.dtype)
-    rim = circle.centre + 0.95 * circle.radius * jnp.stack([jnp.cos(turn), jnp.sin(turn)], -1)
+    rim = circle.centre[None] + 0.95 * circle.radius * unit(turn)
     return jnp.all(_seen(rim, scan, lidar))
 
 
@@ -236,8 +250,8 @@ def find_junctions(
     good &= (size < 0.04) & _seen(circle.centre, scan, lidar)
     certified = jax.vmap(_rim_seen, in_axes=(0, None, None))(circle, scan, lidar)
     # Several cells may lead to one circle.
-    order = jnp.argsort(-(good * (1.0 + certified + 0.1 * circle.radius)), stable=True)
-    pick = lambda x: x[order]
+    worth = 1.0 + certified.astype(place.dtype) + 0.1 * circle.radius
+    order = jnp.argsort(-jnp.where(good, worth, 0.0), stable=True)
     centre, good = circle.centre[order], good[order]
     gap = jnp.linalg.norm(centre[:, None] - centre[None], axis=2)
     earlier = jnp.tril(jnp.ones(gap.shape, bool), -1)
@@ -345,6 +359,67 @@ def _blank(nodes: Nodes) -> Nodes:
         return jnp.where(keep.reshape(keep.shape + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
 
     return jax.tree.map(clear, nodes)._replace(kind=nodes.kind)
+
+
+def find_links(
+    found: Nodes,
+    diagram: Diagram,
+    sources: Array,
+    scan: Scan,
+    lidar: Lidar,
+    grid: GridSpec,
+    spec: NodeSpec,
+) -> Links:
+    """Which junctions the branches of a diagram join.
+
+    The ids of the junctions expand along the branches, by the same automaton as the fronts before;
+    where two ids meet, an arc is found.
+
+    Args:
+        found: Features of the scan, junctions first.
+        diagram: Its diagram.
+        sources: (H, W) bool, the cells the fronts came from.
+        scan: The scan.
+        lidar: The scanner.
+        grid: The grid of the diagram.
+        spec: Capacities; at most seven junctions, the bits of a uint8.
+    """
+    count = spec.nodes
+    place, valid = found.xy[:count], found.valid[:count]
+    middle = centres(grid).astype(place.dtype)
+    near = jnp.linalg.norm(middle[None] - place[:, None, None], axis=-1) < 2.5 * grid.cell
+    near &= valid[:, None, None]  # (N, H, W)
+    bit = jnp.uint8(1) << jnp.arange(count, dtype=jnp.uint8)
+    seeds = jnp.zeros(grid.shape, jnp.uint8)
+    for k in range(count):
+        seeds |= jnp.where(near[k], bit[k], jnp.uint8(0))
+    branch = branches(diagram, sources).astype(jnp.uint8)
+    thick = (block_union(branch) > 0) & (diagram.labels != 0) & ~sources
+    met = expand(seeds, thick | (seeds != 0), steps=LINK_STEPS)
+    ids, when = met.labels, jnp.where(met.arrival >= 0, met.arrival, LINK_STEPS + 1)
+    # An even meet: one id here, another next door.
+    beside = jnp.zeros_like(ids)
+    for other in around(single(ids)):
+        beside |= other
+    both = ids | jnp.where(single(ids) != 0, beside, jnp.uint8(0))
+
+    first, second = np.triu_indices(count, 1)
+    hits = points(scan, lidar)
+
+    def link(i: Array, j: Array) -> tuple[Array, Array, Array]:
+        want = bit[i] | bit[j]
+        here = jnp.where(both & want == want, when, LINK_STEPS + 1).reshape(-1)
+        at = jnp.argmin(here)
+        via = centre_of(jnp.stack([at // grid.shape[1], at % grid.shape[1]]), grid)
+        via = via.astype(place.dtype)
+        away = jnp.linalg.norm(hits - via[None], axis=1)
+        room = jnp.min(jnp.where(scan.hit, away, jnp.inf))
+        room = jnp.minimum(room, jnp.minimum(found.shape[i], found.shape[j]))
+        return via, room, (here[at] <= LINK_STEPS) & valid[i] & valid[j]
+
+    via, room, joined = jax.vmap(link)(jnp.asarray(first), jnp.asarray(second))
+    pair = jnp.stack([jnp.asarray(first), jnp.asarray(second)], axis=1).astype(jnp.int32)
+    return Links(pair=pair, via=via, clearance=room, valid=joined)
 
 
 def join(*parts: Nodes) -> Nodes:

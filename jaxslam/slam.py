@@ -3,21 +3,42 @@
 `step` is the only place where front end and filter meet, and `run` the only loop over time.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxslam import association, edges, ekf, nodes, voronoi
+from jaxslam import association, edges, ekf, nodes, topomap, voronoi
 from jaxslam.edges import RunSpec
 from jaxslam.ekf import Belief
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
-from jaxslam.motion import process_noise
-from jaxslam.nodes import Nodes, NodeSpec
+from jaxslam.motion import Robot, process_noise, wheel_coefficients
+from jaxslam.nodes import Links, Nodes, NodeSpec
 from jaxslam.types import CORNER, NODE, WALL, Array
+
+BATCH = 16  # scans that are looked at together
+
+
+def map_batches(function: Callable, items: Any, *, size: int) -> Any:
+    """Map `function` over the leading axis of `items`, `size` of them vectorised at a time.
+
+    The last batch is filled up with the last item: unlike `lax.map(batch_size=...)` this compiles
+    the function once.
+    """
+    count = jax.tree.leaves(items)[0].shape[0]
+    size = min(size, count)
+    pad = -count % size
+
+    def fold(x: Array) -> Array:
+        x = jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x
+        return x.reshape((-1, size) + x.shape[1:])
+
+    result = lax.map(jax.vmap(function), jax.tree.map(fold, items))
+    return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:])[:count], result)
 
 
 class Config(NamedTuple):
@@ -101,6 +122,13 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
         nodes.find_walls(runs, config.nodes),
     )
     return found, diagram, sources
+
+
+def local_map(config: Config, scan: Scan) -> tuple[Nodes, Links]:
+    """Local topological map of one scan: its landmarks and the arcs between its junctions."""
+    found, diagram, sources = look(config, scan)
+    links = nodes.find_links(found, diagram, sources, scan, config.lidar, config.grid, config.nodes)
+    return found, links
 
 
 def init(config: Config, pose: Array) -> Belief:
@@ -192,3 +220,54 @@ def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Be
         return step(config, noise, belief, now)
 
     return lax.scan(body, start, inputs)
+
+
+class Survey(NamedTuple):
+    """A log, filtered, with its topological map."""
+
+    belief: Belief  # at the end
+    info: Info  # [T]
+    nodes: Nodes  # [T]
+    graph: topomap.Graph
+
+
+@partial(jax.jit, static_argnames="config")
+def local_maps(config: Config, scans: Scan) -> tuple[Nodes, Links]:
+    """`local_map` of scans that lead with T, a few at a time, which bounds memory."""
+    return map_batches(partial(local_map, config), scans, size=BATCH)
+
+
+@partial(jax.jit, static_argnames="arcs")
+def _arcs(info: Info, links: Links, *, arcs: int) -> topomap.Arcs:
+    return topomap.build(info.id, info.pose, links, arcs=arcs)
+
+
+def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Scan) -> Survey:
+    """Run a whole log, and put its topological map together.
+
+    Args:
+        config: Of front end and filter.
+        noise: What the filter assumes.
+        start: (3,) first pose.
+        motions: (T, 3) odometry since the scan before, zero at the first.
+        scans: [T].
+    """
+    seen, links = local_maps(config, scans)
+    belief, info = run(config, noise, init(config, start), Inputs(motions, seen))
+    arcs = _arcs(info, links, arcs=2 * config.landmarks)
+    return Survey(belief, info, seen, topomap.graph(belief, arcs, confirm=config.confirm))
+
+
+def wheel_noise(robot: Robot) -> Noise:
+    """Noise of a simulated robot: its encoders, and how well the front end finds landmarks."""
+    return _noise(wheel_coefficients(robot), range=0.01, bearing=0.005, scale=1.0, wall=0.003)
+
+
+def log_noise() -> Noise:
+    """Noise for recorded logs of unknown robots: cautious."""
+    return _noise(jnp.full(4, 0.05), range=0.05, bearing=0.01, scale=1.5, wall=0.03)
+
+
+def _noise(odometry: Array, **rest: float) -> Noise:
+    odometry = jnp.asarray(odometry, float)
+    return Noise(odometry, **{name: jnp.asarray(value, float) for name, value in rest.items()})

@@ -1,0 +1,30 @@
+import json
+import sys
+
+import pytest
+
+from experiments import fig02_expansion
+
+
+def test_figure_2_is_written_and_equals_the_paper(tmp_path, monkeypatch):
+    out = tmp_path / "new" / "folder"
+    monkeypatch.setattr(sys, "argv", ["fig02_expansion", "--out", str(out), "--seed", "0"])
+    fig02_expansion.main()
+    numbers = json.loads((out / "fig02_expansion.json").read_text())
+    assert numbers["equal_to_paper"] is True
+    assert numbers["two"][2] == "2,v1 1,v1 (v1) 1,v1 * 1,v2 (v2) 1,v2 2,v2".split()
+    assert numbers["meets_one_step_later"] == [[i, 4] for i in range(5)]
+    picture = (out / "fig02_expansion.png").read_bytes()
+    assert picture.startswith(b"\x89PNG") and len(picture) > 5000
+
+
+def test_a_wrong_table_is_told(monkeypatch):
+    monkeypatch.setattr(fig02_expansion, "STEPS", 2)
+    assert fig02_expansion.compute()["equal_to_paper"] is False
+
+
+def test_the_folder_for_the_results_must_be_named(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["fig02_expansion"])
+    with pytest.raises(SystemExit):
+        fig02_expansion.main()
+    assert "--out" in capsys.readouterr().err

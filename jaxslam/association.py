@@ -24,7 +24,7 @@ def match(distance: Array, possible: Array, *, gate: float, margin: float) -> Ar
     d = jnp.where(possible & jnp.isfinite(distance), distance, jnp.inf)
     best = jnp.argmin(d, axis=1)
     nearest = jnp.take_along_axis(d, best[:, None], axis=1)[:, 0]
-    others = jnp.where(jnp.arange(l) == best[:, None], jnp.inf, d)
+    others = jnp.where(jnp.arange(l)[None] == best[:, None], jnp.inf, d)
     clear = jnp.min(others, axis=1) > nearest + margin
     mutual = jnp.argmin(d, axis=0)[best] == jnp.arange(m)
     return jnp.where((nearest < gate) & clear & mutual, best, l).astype(jnp.int32)

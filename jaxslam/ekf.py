@@ -99,8 +99,8 @@ def predict(belief: Belief, motion: Array, noise: Array) -> Belief:
     way = moved[:2] - pose[:2]
     lever = jnp.stack([-way[1], way[0]])
     cov = belief.cov
-    cov = cov.at[:2].add(lever[:, None] * cov[2])
-    cov = cov.at[:, :2].add(cov[:, 2:3] * lever)
+    cov = cov.at[:2].add(lever[:, None] * cov[2:3])
+    cov = cov.at[:, :2].add(cov[:, 2:3] * lever[None])
     turn = jnp.eye(3, dtype=noise.dtype).at[:2, :2].set(rotation(pose[2]))
     return belief._replace(
         mean=belief.mean.at[:3].set(moved), cov=cov.at[:3, :3].add(turn @ noise @ turn.T)
@@ -303,7 +303,7 @@ def augment(
     pose = belief.pose
     place = to_world(pose, xy)
     wall = jnp.stack([wrap_line(direction + pose[2]), jnp.zeros_like(direction)], axis=-1)
-    arm = place - pose[:2]
+    arm = place - pose[None, :2]
     zero, one = jnp.zeros_like(direction), jnp.ones_like(direction)
     by_pose = jnp.stack(
         [jnp.stack([one, zero, -arm[:, 1]], -1), jnp.stack([zero, one, arm[:, 0]], -1)], axis=1
@@ -321,8 +321,8 @@ def augment(
     index = jnp.arange(most)
     own = jnp.einsum("mij,mjk,mlk->mil", by_seen, noise[order], by_seen)
     among = among.at[index, :, index].add(own)  # (F, 2, F, 2)
-    at = jnp.where(slot[:, None] < size, 3 + 2 * slot[:, None] + jnp.arange(2), 3 + 2 * size)
-    at = at.reshape(-1)
+    at = jnp.where(slot < size, 3 + 2 * slot, 3 + 2 * size)
+    at = jnp.stack([at, jnp.minimum(at + 1, 3 + 2 * size)], axis=-1).reshape(-1)
     rows = rows.reshape(2 * most, -1).at[:, at].set(among.reshape(2 * most, -1), mode="drop")
     cov = belief.cov.at[at].set(rows, mode="drop").at[:, at].set(rows.T, mode="drop")
     mean = belief.mean.at[at].set(jnp.where(is_wall, wall, place).reshape(-1), mode="drop")
@@ -337,7 +337,7 @@ def augment(
         seen=put(belief.seen, jnp.ones_like(slot)),
         last=put(belief.last, jnp.broadcast_to(belief.step, slot.shape)),
         kind=put(belief.kind, kind),
-        id=put(belief.id, belief.next_id + jnp.cumsum(taken) - 1),
+        id=put(belief.id, belief.next_id + jnp.cumsum(taken, dtype=jnp.int32) - 1),
         direction=put(belief.direction, wrap_angle(direction + pose[2])),
         shape=put(belief.shape, nodes.shape[order]),
         next_id=belief.next_id + jnp.sum(taken, dtype=jnp.int32),
@@ -356,11 +356,12 @@ def alike(belief: Belief, nodes: Nodes, *, shape: float, turn: float) -> Array:
     Same kind; nodes of like clearance (`shape`, in logarithm), corners of like angle that face
     like directions (`turn` [rad]).
     """
-    same = (nodes.kind[:, None] == belief.kind) & (belief.seen > 0) & nodes.valid[:, None]
-    ratio = jnp.maximum(nodes.shape[:, None], 1e-3) / jnp.maximum(belief.shape, 1e-3)
+    same = nodes.kind[:, None] == belief.kind[None]
+    same &= (belief.seen > 0)[None] & nodes.valid[:, None]
+    ratio = jnp.maximum(nodes.shape[:, None], 1e-3) / jnp.maximum(belief.shape[None], 1e-3)
     clearance = jnp.abs(jnp.log(ratio)) < shape
-    facing = wrap_angle(nodes.direction[:, None] + belief.pose[2] - belief.direction)
-    opening = nodes.shape[:, None] - belief.shape
+    facing = wrap_angle(nodes.direction[:, None] + belief.pose[2] - belief.direction[None])
+    opening = nodes.shape[:, None] - belief.shape[None]
     corner = (jnp.abs(facing) < turn) & (jnp.abs(opening) < turn)
     kind = nodes.kind[:, None]
     return same & jnp.where(kind == NODE, clearance, jnp.where(kind == CORNER, corner, True))

@@ -256,8 +256,8 @@ def find_junctions(
     gap = jnp.linalg.norm(centre[:, None] - centre[None], axis=2)
     earlier = jnp.tril(jnp.ones(gap.shape, bool), -1)
     good &= ~jnp.any(earlier & good[None, :] & (gap < 0.25), axis=1)
-    order = order[jnp.argsort(~good, stable=True)[: spec.nodes]]
-    good = jnp.sort(~good, stable=True)[: spec.nodes] == 0
+    first = jnp.argsort(~good, stable=True)[: spec.nodes]
+    order, good = order[first], good[first]
     zero = jnp.zeros(spec.nodes, place.dtype)
     return _blank(
         Nodes(

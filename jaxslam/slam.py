@@ -140,7 +140,7 @@ def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
     """Covariance (M, 2, 2) of the features in range and bearing, or in direction (and 0)."""
     own = jax.vmap(ekf.polar_cov)(nodes.xy, nodes.cov)
     floor = jnp.diag(jnp.stack([noise.range, noise.bearing]) ** 2)
-    point = noise.scale**2 * own + floor
+    point = noise.scale**2 * own + floor[None]
     wall = noise.scale**2 * nodes.variance + noise.wall**2
     zero = jnp.zeros_like(wall)
     wall = jnp.stack([jnp.stack([wall, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
@@ -149,7 +149,7 @@ def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
 
 def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Array) -> Array:
     """Features (M,) bool that are far from all landmarks of their kind."""
-    same = (nodes.kind[:, None] == belief.kind) & (belief.seen > 0)
+    same = (nodes.kind[:, None] == belief.kind[None]) & (belief.seen > 0)[None]
     place = ekf.to_world(belief.pose, nodes.xy)
     gap = jnp.linalg.norm(place[:, None] - belief.places[None], axis=2)
     turn = jnp.abs(
@@ -196,7 +196,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh)
 
     slot = jnp.minimum(slot, fresh)
-    dof = jnp.sum(jnp.where(seen.kind == WALL, 1, 2) * used, dtype=jnp.int32)
+    rank = jnp.where(seen.kind == WALL, 1, 2)
+    dof = jnp.sum(jnp.where(used, rank, 0), dtype=jnp.int32)
     density = nis + logdet + dof.astype(nis.dtype) * jnp.log(2 * jnp.pi).astype(nis.dtype)
     info = Info(
         pose=after.pose,
@@ -214,8 +215,13 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
 
 @partial(jax.jit, static_argnames="config")
 def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Belief, Info]:
-    """Filter one log: `inputs` leads with T, and so does the info."""
+    """Filter one log: `inputs` leads with T, and so does the info.
 
+    A derivative computes each step again instead of storing it, so that it needs the memory of T
+    beliefs only.
+    """
+
+    @jax.checkpoint
     def body(belief: Belief, now: Inputs) -> tuple[Belief, Info]:
         return step(config, noise, belief, now)
 

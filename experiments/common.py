@@ -135,3 +135,30 @@ def draw_picture(axis, drawn: Numbers) -> None:
     axis.plot(0, 0, "^", color=RED, markersize=8, clip_on=False)
     axis.set(xlim=(left, right), ylim=(low, high), aspect="equal")
     axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")
+
+
+def scene(name: str = "office"):
+    """World, robot, path (N, 2) and number of scans of the drive in a world."""
+    from jaxslam import monte_carlo, plan
+    from jaxslam.motion import Robot
+
+    robot, path = Robot(), jnp.asarray(plan.densify(world.drive(name)), float)
+    place = world.World(jnp.asarray(world.named(name).walls, float))
+    return place, robot, path, monte_carlo.drive_steps(robot, path)
+
+
+def many(key, config: slam.Config, noise: slam.Noise, runs: int, name: str = "office"):
+    """Tracks of B runs of the drive in a world, with a progress bar."""
+    from tqdm import tqdm
+
+    from jaxslam import monte_carlo
+
+    place, robot, path, steps = scene(name)
+    parts = []
+    with tqdm(total=runs, unit="run", leave=False) as bar:
+        for part in monte_carlo.experiment(
+            key, config, noise, place, robot, path, runs=runs, steps=steps
+        ):
+            parts.append(part)
+            bar.update(len(part.finite))
+    return monte_carlo.collect(parts)

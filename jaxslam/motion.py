@@ -13,7 +13,7 @@ class Robot(NamedTuple):
     """A robot with two driven wheels, the origin of its frame midway; static under jit."""
 
     base: float = 0.4  # [m] between the wheels
-    wheel_noise: float = 0.01  # [m / sqrt(m)] std of a wheel's encoder per root of a metre rolled
+    wheel_noise: float = 0.005  # [m / sqrt(m)] std of a wheel's encoder per root of a metre rolled
 
 
 def arc(distance: Array, turn: Array) -> Array:

@@ -422,6 +422,14 @@ def find_links(
     return Links(pair=pair, via=via, clearance=room, valid=joined)
 
 
+def restrict(nodes: Nodes, wanted: Array) -> Nodes:
+    """Blank the landmarks that are not valid, not `wanted` (M,) bool, or hold NaN or infinity."""
+    numbers = (nodes.xy, nodes.cov, nodes.direction, nodes.variance, nodes.shape)
+    for x in numbers:
+        wanted &= jnp.all(jnp.isfinite(x.reshape(x.shape[0], -1)), axis=1)
+    return _blank(nodes._replace(valid=nodes.valid & wanted))
+
+
 def join(*parts: Nodes) -> Nodes:
     """All landmarks of a scan in one record."""
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)

@@ -26,12 +26,12 @@ GREY = "#8C8C8C"
 SIGMAS = 3.0  # standard deviations that ellipses and bounds show
 DOTS = 40_000  # ends of beams drawn at most
 
-# Colour, width and dashes of each trajectory, the one to be seen best first.
+# Colour, width, dashes and height in the picture of each trajectory.
 LINES = {
-    "estimate": (BLUE, 1.6, "-"),
-    "truth": (BLACK, 1.2, (0, (4, 2))),
-    "reference": (BLACK, 1.2, (0, (4, 2))),
-    "odometry": (RED, 1.1, (0, (1, 1.2))),
+    "estimate": (SKY, 3.0, "-", 2.0),
+    "truth": (BLACK, 1.2, (0, (4, 2)), 2.2),
+    "reference": (BLACK, 1.2, (0, (4, 2)), 2.2),
+    "odometry": (RED, 1.1, (0, (1, 1.2)), 2.1),
 }
 # Marker, colour and name in the legend of each kind of landmark that has a place.
 MARKS = {NODE: ("o", GREEN, "node"), CORNER: ("s", ORANGE, "corner")}
@@ -95,9 +95,9 @@ def trajectory(axis: Axes, poses: np.ndarray, what: str) -> None:
         poses: (T, 3), world.
         what: One of `LINES`; also its name in the legend.
     """
-    color, width, dashes = LINES[what]
-    x, y = np.asarray(poses)[:, :2].T
-    axis.plot(x, y, color=color, linewidth=width, linestyle=dashes, label=what)
+    color, width, dashes, height = LINES[what]
+    style = {"color": color, "linewidth": width, "linestyle": dashes, "zorder": height}
+    axis.plot(*np.asarray(poses)[:, :2].T, label=what, **style)
 
 
 def ends(axis: Axes, poses: np.ndarray) -> None:
@@ -179,7 +179,7 @@ def errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -
         axis.set(ylabel=name, xlim=(0, max(len(scan) - 1, 1)))
         axis.margins(y=0.08)
     axes[-1].set_xlabel("scan")
-    axes[0].legend(loc="upper left", ncols=2, frameon=False)
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
 
 
 def local(

@@ -166,10 +166,9 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
 
     Matches are integers: derivatives are those of the filter with its matches held fixed.
     """
-    seen = inputs.nodes
     size = belief.seen.size
-    allowed = jnp.isin(seen.kind, jnp.array(config.kinds, jnp.int32))
-    seen = seen._replace(valid=seen.valid & allowed)
+    allowed = jnp.isin(inputs.nodes.kind, jnp.array(config.kinds, jnp.int32))
+    seen = nodes.restrict(inputs.nodes, allowed)
     q = process_noise(noise.odometry, inputs.motion)
     before = ekf.predict(belief, inputs.motion, q)._replace(step=belief.step + 1)
     r = sensor_noise(noise, seen)
@@ -266,7 +265,7 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
 
 def wheel_noise(robot: Robot) -> Noise:
     """Noise of a simulated robot: its encoders, and how well the front end finds landmarks."""
-    return _noise(wheel_coefficients(robot), range=0.01, bearing=0.005, scale=1.0, wall=0.003)
+    return _noise(wheel_coefficients(robot), range=0.006, bearing=0.003, scale=1.0, wall=0.002)
 
 
 def log_noise() -> Noise:

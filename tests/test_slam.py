@@ -1,0 +1,263 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from jaxslam import lidar, motion, slam, world
+from jaxslam.geometry import compose
+from jaxslam.monte_carlo import dead_reckoning
+from jaxslam.nodes import Nodes
+from jaxslam.slam import Config, Inputs
+from jaxslam.types import CORNER, NODE, WALL
+
+T, M = 8, 9
+CONFIG = Config(landmarks=10, matches=5, fresh=4, confirm=3, patience=2)
+NOISE = slam.wheel_noise(motion.Robot())
+KINDS = np.array([NODE, NODE, NODE, CORNER, CORNER, CORNER, WALL, WALL])
+PLACES = np.array([[4.0, 1], [2, -3], [1, 4], [5, -2], [-3, 2], [6, 4], [0.3, 0], [-1.2, 0]])
+FACING = np.array([0.0, 0.0, 0.0, 1.0, -2.0, 2.5, 0.0, 0.0])
+SHAPE = np.array([0.5, 1.0, 2.0, 1.5, 1.5, 4.7, 0.0, 0.0])
+MOTION = np.array([0.25, 0.0, 0.12])
+stepped = jax.jit(slam.step, static_argnums=0)
+
+
+def sight(rng, pose, *, only=range(8), kinds=KINDS, places=PLACES):
+    """Features (M,) of the landmarks `only`, seen from `pose` with 1 cm and 2 mrad of noise."""
+    seen = np.array(sorted(only), int)
+    pad = lambda x: np.concatenate([x, np.zeros((M - len(seen),) + x.shape[1:], x.dtype)])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    wall = kinds[seen] == WALL
+    xy = (places[seen] - pose[:2]) @ np.array([[c, -s], [s, c]])
+    xy = np.where(wall[:, None], 0.0, xy + 0.01 * rng.normal(size=xy.shape))
+    turn = np.where(wall, places[seen, 0] + 0.002 * rng.normal(size=len(seen)), FACING[seen])
+    return Nodes(
+        kind=pad(kinds[seen].astype(np.int32)),
+        xy=pad(xy),
+        cov=pad(np.where(wall[:, None, None], 0.0, 1e-4 * np.eye(2)) + np.zeros((len(seen), 2, 2))),
+        direction=pad(np.where(kinds[seen] == NODE, 0.0, turn - pose[2])),
+        variance=pad(np.where(wall, 4e-6, 0.0)),
+        shape=pad(SHAPE[seen]),
+        degree=pad(np.full(len(seen), 3, np.int32)),
+        certified=pad(np.ones(len(seen), bool)),
+        valid=pad(np.ones(len(seen), bool)),
+    )
+
+
+def drive(seed, *, only=lambda t: range(8)):
+    """True poses (T, 3) of a short drive, and what the filter is given at each of T steps."""
+    rng = np.random.default_rng(seed)
+    poses, told, pose = [], [], np.zeros(3)
+    for t in range(T):
+        told.append(MOTION * (t > 0))
+        if t:
+            error = rng.multivariate_normal(
+                np.zeros(3), motion.process_noise(NOISE.odometry, jnp.array(MOTION))
+            )
+            pose = np.asarray(compose(jnp.array(pose), jnp.array(MOTION + error)))
+        poses.append(pose)
+    seen = [sight(rng, pose, only=only(t)) for t, pose in enumerate(poses)]
+    told = Inputs(np.stack(told), jax.tree.map(lambda *x: np.stack(x), *seen))
+    return np.stack(poses), jax.tree.map(jnp.asarray, told)
+
+
+def start(dtype=float):
+    return slam.init(CONFIG, jnp.zeros(3, dtype))
+
+
+def at(tree, index):
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return [drive(seed) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def together(logs):
+    """Beliefs and infos of the three logs under vmap, and with a NaN in the last one's wheels."""
+    inputs = jax.tree.map(lambda *x: jnp.stack(x), *[told for _, told in logs])
+    many = jax.jit(jax.vmap(lambda told: slam.run(CONFIG, NOISE, start(), told)))
+    broken = inputs._replace(motion=inputs.motion.at[2, 3, 0].set(jnp.nan))
+    return many(inputs), many(broken)
+
+
+def close(one, two, atol):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), one, two)
+
+
+def test_step_is_traced_once_and_run_equals_a_loop(logs):
+    told, belief, traced, infos = logs[0][1], start(), [], []
+
+    @jax.jit
+    def counted(belief, now):
+        traced.append(1)  # runs while tracing only
+        return slam.step(CONFIG, NOISE, belief, now)
+
+    for t in range(T):
+        belief, info = counted(belief, at(told, t))
+        infos.append(info)
+    assert len(traced) == 1
+    whole = slam.run(CONFIG, NOISE, start(), told)
+    close(whole, (belief, jax.tree.map(lambda *x: np.stack(x), *infos)), atol=1e-9)
+
+
+def test_vmap_equals_a_loop_over_runs(logs, together):
+    for b, (_, told) in enumerate(logs):
+        close(at(together[0], b), slam.run(CONFIG, NOISE, start(), told), atol=1e-9)
+
+
+def test_the_estimate_follows_the_truth_and_its_matches_are_right(logs):
+    truth, told = logs[0]
+    belief, info = slam.run(CONFIG, NOISE, start(), told)
+    assert np.abs(info.pose - truth)[:, :2].max() < 0.05 and info.finite.all()
+    blind = dead_reckoning(jnp.zeros(3), told.motion)
+    assert np.linalg.norm((info.pose - truth)[-1, :2]) < np.linalg.norm((blind - truth)[-1, :2])
+    # Feature k is landmark k in all scans: whoever got an id keeps it.
+    for ids in np.asarray(info.id).T:
+        assert len(set(ids[ids >= 0])) <= 1
+    assert np.all(info.id[-1, :8] >= 0) and np.all(info.id[:, 8] == -1)
+    assert sorted(np.asarray(belief.id[belief.seen > 0])) == list(range(8))
+
+
+def test_a_nan_run_is_reported_and_leaves_its_neighbours_alone(together):
+    good, bad = together
+    close(at(bad, slice(0, 2)), at(good, slice(0, 2)), atol=0)
+    assert good[1].finite.all() and bad[1].finite[:2].all()
+    np.testing.assert_array_equal(bad[1].finite[2], np.arange(T) < 3)
+    assert np.isfinite(bad[1].log_likelihood).all()
+
+
+@pytest.mark.parametrize("field", ["xy", "cov", "direction", "variance"])
+def test_a_nan_feature_is_as_good_as_none(logs, field):
+    told = logs[0][1]
+    k = 7 if field in ("direction", "variance") else 4
+    value = getattr(told.nodes, field).at[2:5, k].set(jnp.nan)
+    sick = told._replace(nodes=told.nodes._replace(**{field: value}))
+    none = told._replace(nodes=told.nodes._replace(valid=told.nodes.valid.at[2:5, k].set(False)))
+    sick, none = (slam.run(CONFIG, NOISE, start(), log) for log in (sick, none))
+    close(sick, none, atol=0)
+    assert sick[1].finite.all()
+
+
+@pytest.fixture(scope="module")
+def objective():
+    """Mean squared position error of a drive as a function of the logarithms of the noise."""
+    log_noise, unravel = ravel_pytree(jax.tree.map(jnp.log, NOISE))
+
+    def loss(log_noise, told, truth):
+        noise = jax.tree.map(jnp.exp, unravel(log_noise))
+        _, info = slam.run(CONFIG, noise, start(), told)
+        return jnp.mean(jnp.sum((info.pose - truth)[:, :2] ** 2, axis=1)), info.slot
+
+    return log_noise, jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
+
+
+def test_gradient_of_the_localisation_error_equals_finite_differences(objective, logs):
+    log_noise, loss, slope = objective
+    truth, told = logs[0]
+    (_, slot), ours = slope(log_noise, told, truth)
+    assert log_noise.size == 8 and np.all(ours != 0)
+    for k, direction in enumerate(1e-4 * np.eye(8)):
+        (high, up), (low, down) = (loss(log_noise + s * direction, told, truth) for s in (1, -1))
+        np.testing.assert_array_equal(up, slot)
+        np.testing.assert_array_equal(down, slot)
+        np.testing.assert_allclose(ours[k], (high - low) / 2e-4, rtol=1e-4)
+        print("REL", k, float(ours[k]), float(ours[k] / ((high - low) / 2e-4) - 1))
+
+
+@pytest.mark.parametrize("junk", [7.0, jnp.nan])
+def test_padding_is_invisible_in_values_and_gradients(objective, logs, junk):
+    log_noise, _, slope = objective
+    truth, told = logs[0]
+    nodes = told.nodes
+    clean = nodes._replace(valid=nodes.valid.at[:, 6].set(False))  # and 8 never was
+    fill = lambda x: x.at[:, jnp.array([6, 8])].set(junk)
+    dirty = clean._replace(
+        **{name: fill(getattr(nodes, name)) for name in ("xy", "cov", "direction", "variance")}
+    )
+    clean, dirty = (slope(log_noise, told._replace(nodes=n), truth) for n in (clean, dirty))
+    close(clean, dirty, atol=0)
+
+
+def test_candidates_do_not_move_the_pose_before_they_are_confirmed(logs):
+    _, told = logs[0]
+    _, info = slam.run(CONFIG, NOISE, start(), told)
+    blind = dead_reckoning(jnp.zeros(3), told.motion)
+    first = CONFIG.confirm - 1
+    assert np.all(info.id[1, :4] >= 0)  # they are matched, all the same
+    assert not info.used[:first].any() and info.used[first, :4].all()
+    np.testing.assert_allclose(info.pose[:first], blind[:first], atol=1e-12)
+    assert np.linalg.norm(info.pose[first] - blind[first]) > 1e-4
+
+
+def test_unconfirmed_landmarks_are_dropped_and_their_slots_used_again(logs):
+    _, told = drive(0, only=lambda t: [0, 1] if t < 3 else [])
+    belief, seen = start(), []
+    _, late = drive(0, only=lambda t: [0, 1, 2, 3] if t == 1 else [0, 1])
+    _, other = drive(0, only=lambda t: [4])
+    for t in range(T):
+        belief, info = stepped(CONFIG, NOISE, belief, at(other if t == 5 else late, t))
+        seen.append(np.asarray(belief.seen[:5]))
+    # 0 and 1 are confirmed; 2 and 3 were seen at the second step only, and outlive two more.
+    np.testing.assert_array_equal(np.stack(seen)[1:5, 2:4], [[1, 1], [1, 1], [1, 1], [0, 0]])
+    np.testing.assert_array_equal(seen[5][2:5], [1, 0, 0])
+    assert np.all(seen[-1][:2] >= CONFIG.confirm)
+    np.testing.assert_array_equal(belief.id[:3], [0, 1, 4])
+    assert belief.next_id == 5
+
+
+def test_new_landmarks_respect_fresh_and_a_full_map(logs):
+    truth, told = logs[0]
+    _, info = slam.run(CONFIG, NOISE, start(), told)
+    np.testing.assert_array_equal(info.id[0], [0, 1, 2, 3, *[-1] * 5])
+    np.testing.assert_array_equal(info.id[1], [*range(8), -1])
+    small = CONFIG._replace(landmarks=5)
+    belief = slam.init(small, jnp.zeros(3))
+    for t in range(3):
+        belief, info = stepped(small, NOISE, belief, at(told, t))
+    np.testing.assert_array_equal(info.id, [*range(5), *[-1] * 4])
+    np.testing.assert_array_equal(info.slot[5:], 5)
+    assert belief.next_id == 5 and np.isfinite(belief.cov).all()
+
+
+def test_only_the_kinds_of_the_config_are_used(logs):
+    only = CONFIG._replace(kinds=(NODE,), confirm=1)
+    belief, info = start(), None
+    for t in range(2):
+        belief, info = stepped(only, NOISE, belief, at(logs[0][1], t))
+    np.testing.assert_array_equal(info.used, np.arange(M) < 3)
+    assert info.dof == 6
+
+
+def test_the_whole_chain_runs_in_float32():
+    """Scans of Fig. 7 in the default precision of production; the filter close to float64."""
+    config = CONFIG._replace(landmarks=24, confirm=2)
+    rooms, pose = world.named("fig07"), np.array([2.2, 2.3, 2.0])
+    turn = np.array([0.0, 0.0, 0.1])
+    with jax.enable_x64(False):
+        look = jax.jit(slam.front_end, static_argnums=0)
+        walls = world.World(jnp.asarray(rooms.walls, jnp.float32))
+        nodes = [
+            look(config, lidar.cast(walls, jnp.asarray(pose + t * turn, jnp.float32), config.lidar))
+            for t in range(4)
+        ]
+        assert nodes[0].xy.dtype == jnp.float32
+        nodes = jax.tree.map(lambda *x: np.stack(x), *nodes)
+
+    def run(dtype):
+        cast = lambda x: jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype)
+        told = jax.tree.map(cast, Inputs(np.outer(np.arange(4) > 0, turn), nodes))
+        noise = jax.tree.map(lambda x: cast(np.asarray(x)), NOISE)
+        belief, info = slam.run(config, noise, slam.init(config, jnp.asarray(pose, dtype)), told)
+        assert belief.cov.dtype == info.pose.dtype == info.nis.dtype == dtype
+        return jax.tree.map(np.asarray, info)
+
+    double = run(jnp.float64)
+    with jax.enable_x64(False):
+        single = run(jnp.float32)
+    np.testing.assert_array_equal(single.slot, double.slot)
+    assert double.used.any() and single.finite.all()
+    np.testing.assert_allclose(single.pose, double.pose, atol=1e-5)
+    np.testing.assert_allclose(single.pose_cov, double.pose_cov, atol=1e-6)

@@ -362,8 +362,9 @@ def _draw(
     from jaxslam import plot  # matplotlib takes its time to load
 
     poses = _poses(survey)
-    around = [poses, *lines.values()] if world is None else [np.reshape(world.walls, (-1, 2))]
-    figure, axis = plot.plan(*plot.extent(*around))
+    walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
+    shown = [poses, survey.graph.xy, *lines.values(), *walls]
+    figure, axis = plot.plan(*plot.extent(*shown))
     if world is not None:
         plot.walls(axis, world)
     if scans is not None:

@@ -186,22 +186,32 @@ def _fit(xy: Array, member: Array, noise: float) -> tuple[Array, ...]:
     return normal, centre, variance, weight, jnp.maximum(half + tilt, 1e-6)
 
 
-def _merge(breaks: Array, xy: Array, scan: Scan, jump: Array, lidar: Lidar, spec: RunSpec) -> Array:
-    """Undo breaks between neighbours that lie on one line."""
+def _tolerance(lidar: Lidar, spec: RunSpec) -> float:
+    """How far [m] the points of one wall may lie from a line through two of them."""
+    return max(spec.bend, 4.5 * lidar.noise)
+
+
+def _merge(breaks: Array, xy: Array, scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
+    """Undo breaks between stretches of adjacent beams that lie on one line.
+
+    The better line of the two is the judge, at the middle of the other.
+    """
     of_beam = _claim(breaks, scan.hit, spec.capacity)
     index = jnp.arange(spec.capacity, dtype=jnp.int32)
     member = of_beam[None] == index[:, None]
-    normal, centre, variance, weight, spread = _fit(xy, member, lidar.noise)
-    gap = jnp.roll(centre, -1, axis=0) - centre
-    enough = weight >= 3
-    off = jnp.maximum(jnp.abs(dot(gap, normal)), jnp.abs(dot(gap, jnp.roll(normal, -1, axis=0))))
-    turn = jnp.abs(cross(normal, jnp.roll(normal, -1, axis=0)))
-    same = enough & jnp.roll(enough, -1) & (off < 0.6 * spec.bend)
-    same &= (turn < 0.2) & (dot(normal, jnp.roll(normal, -1, axis=0)) > 0.0)
+    normal, centre, _, weight, spread = _fit(xy, member, lidar.noise)
+    following = lambda x: jnp.roll(x, -1, axis=0)
+    gap = following(centre) - centre
+    by_own, by_next = jnp.abs(dot(gap, normal)), jnp.abs(dot(gap, following(normal)))
+    off = jnp.where(spread >= following(spread), by_own, by_next)
+    same = (weight >= 3) & (following(weight) >= 3) & (off < 0.6 * _tolerance(lidar, spec))
+    same &= (jnp.abs(cross(normal, following(normal))) < 0.2) & (dot(normal, following(normal)) > 0)
     same &= index < spec.capacity - 2
     joins = jnp.roll(same, 1).at[0].set(False)
+    # Where the shortest stretches share a run, the next run need not be the next stretch.
+    beside = jnp.roll(of_beam, 1) == of_beam - 1
     slot = jnp.clip(of_beam, 0, spec.capacity - 1)
-    return breaks & ~(joins[slot] & ~jump & (of_beam < spec.capacity))
+    return breaks & ~(joins[slot] & beside & (of_beam < spec.capacity))
 
 
 def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
@@ -213,9 +223,9 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     """
     xy = points(scan, lidar)
     jump = jumps(scan, lidar, spec)
-    tolerance = jnp.asarray(max(spec.bend, 3.5 * lidar.noise), xy.dtype)
+    tolerance = jnp.asarray(_tolerance(lidar, spec), xy.dtype)
     breaks = _split(xy, jump, tolerance, spec.splits)
-    breaks = _merge(breaks, xy, scan, jump, lidar, spec)
+    breaks = _merge(breaks, xy, scan, lidar, spec)
 
     of_beam = _claim(breaks, scan.hit, spec.capacity)
     beam = jnp.arange(lidar.beams, dtype=jnp.int32)

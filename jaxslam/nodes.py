@@ -55,7 +55,7 @@ class NodeSpec(NamedTuple):
     least: float = 0.35  # [m] smallest clearance of a node
     most: float = 3.2  # [m] largest
     apart: float = 0.7  # [rad] three feet of a node must differ by this, seen from it
-    wall_length: float = 1.0  # [m] of a run whose direction counts
+    wall_length: float = 2.0  # [m] of a run whose direction counts
     corner_length: float = 0.3  # [m] of the runs of a corner
     corner_angle: float = 0.6  # [rad] by which these must turn
     touch: float = 0.1  # [m] walls this close to the circle of a node touch it

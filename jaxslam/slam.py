@@ -58,10 +58,11 @@ class Config(NamedTuple):
     margin: float = 4.0  # squared distance between the best match and the next
     far: float = 25.0  # squared distance from which a feature may be new
     apart: float = 0.3  # [m] and distance from the next of its kind
-    wall_apart: float = 0.2  # [rad] likewise between wall directions
+    wall_apart: float = 0.26  # [rad] likewise between wall directions
     alike_shape: float = 0.3  # logarithm of the ratio of clearances
     alike_turn: float = 0.5  # [rad] between directions of corners
     confirm: int = 2  # sightings from which a landmark counts
+    wall_confirm: int = 4  # likewise a wall direction: most scans show one, and a wrong one harms
     patience: int = 40  # steps after which an unconfirmed one is dropped
 
 
@@ -176,7 +177,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     distance = lax.stop_gradient(ekf.distances(before, seen, r))
     possible = ekf.alike(before, seen, shape=config.alike_shape, turn=config.alike_turn)
     slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
-    counts = before.seen.at[slot].get(mode="fill", fill_value=0) + 1 >= config.confirm
+    needed = jnp.where(seen.kind == WALL, config.wall_confirm, config.confirm)
+    counts = before.seen.at[slot].get(mode="fill", fill_value=0) + 1 >= needed
     used = (slot < size) & counts
     # A few rows suffice: wall directions first, then as the front end ordered them.
     urgency = jnp.where(used, jnp.where(seen.kind == WALL, 2, 1), 0)

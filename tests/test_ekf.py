@@ -361,11 +361,13 @@ def test_covariance_stays_symmetric_and_positive_definite_in_float32():
             belief, _, _ = ekf.update(belief, ekf.innovations(belief, *now, slot))
             return belief, (belief.pose, belief.cov)
 
-        first = ekf.initial(jnp.zeros(3, dtype), landmarks=M)
-        first, _ = ekf.augment(
-            first, *jax.tree.map(lambda x: x[0], (nodes, r)), jnp.ones(M, bool), most=M
-        )
-        out = jax.jit(lambda first, now: jax.lax.scan(body, first, now)[1])(first, (nodes, r))
+        @jax.jit
+        def whole(first, now):
+            earliest = jax.tree.map(lambda x: x[0], now)
+            first, _ = ekf.augment(first, *earliest, jnp.ones(M, bool), most=M)
+            return jax.lax.scan(body, first, now)[1]
+
+        out = whole(ekf.initial(jnp.zeros(3, dtype), landmarks=M), (nodes, r))
         assert out[0].dtype == dtype
         return jax.tree.map(np.asarray, out)
 

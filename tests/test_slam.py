@@ -1,10 +1,12 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from jaxslam import lidar, motion, slam, world
+from jaxslam import motion, slam
 from jaxslam.geometry import compose
 from jaxslam.monte_carlo import dead_reckoning
 from jaxslam.nodes import Nodes
@@ -19,7 +21,14 @@ PLACES = np.array([[4.0, 1], [2, -3], [1, 4], [5, -2], [-3, 2], [6, 4], [0.3, 0]
 FACING = np.array([0.0, 0.0, 0.0, 1.0, -2.0, 2.5, 0.0, 0.0])
 SHAPE = np.array([0.5, 1.0, 2.0, 1.5, 1.5, 4.7, 0.0, 0.0])
 MOTION = np.array([0.25, 0.0, 0.12])
-stepped = jax.jit(slam.step, static_argnums=0)
+SMALL = CONFIG._replace(landmarks=5, kinds=(NODE, CORNER), confirm=1)
+TRACED = []
+
+
+@partial(jax.jit, static_argnums=0)
+def stepped(config, noise, belief, inputs):
+    TRACED.append(config)  # runs while tracing only
+    return slam.step(config, noise, belief, inputs)
 
 
 def sight(rng, pose, *, only=range(8), kinds=KINDS, places=PLACES):
@@ -88,17 +97,11 @@ def close(one, two, atol):
 
 
 def test_step_is_traced_once_and_run_equals_a_loop(logs):
-    told, belief, traced, infos = logs[0][1], start(), [], []
-
-    @jax.jit
-    def counted(belief, now):
-        traced.append(1)  # runs while tracing only
-        return slam.step(CONFIG, NOISE, belief, now)
-
+    told, belief, infos = logs[0][1], start(), []
     for t in range(T):
-        belief, info = counted(belief, at(told, t))
+        belief, info = stepped(CONFIG, NOISE, belief, at(told, t))
         infos.append(info)
-    assert len(traced) == 1
+    assert TRACED.count(CONFIG) == 1
     whole = slam.run(CONFIG, NOISE, start(), told)
     close(whole, (belief, jax.tree.map(lambda *x: np.stack(x), *infos)), atol=1e-9)
 
@@ -151,7 +154,7 @@ def objective():
         _, info = slam.run(CONFIG, noise, start(), told)
         return jnp.mean(jnp.sum((info.pose - truth)[:, :2] ** 2, axis=1)), info.slot
 
-    return log_noise, jax.jit(loss), jax.jit(jax.value_and_grad(loss, has_aux=True))
+    return log_noise, loss, jax.jit(jax.value_and_grad(loss, has_aux=True))
 
 
 def test_gradient_of_the_localisation_error_equals_finite_differences(objective, logs):
@@ -163,8 +166,7 @@ def test_gradient_of_the_localisation_error_equals_finite_differences(objective,
         (high, up), (low, down) = (loss(log_noise + s * direction, told, truth) for s in (1, -1))
         np.testing.assert_array_equal(up, slot)
         np.testing.assert_array_equal(down, slot)
-        np.testing.assert_allclose(ours[k], (high - low) / 2e-4, rtol=1e-4)
-        print("REL", k, float(ours[k]), float(ours[k] / ((high - low) / 2e-4) - 1))
+        np.testing.assert_allclose(ours[k], (high - low) / 2e-4, rtol=1e-5)
 
 
 @pytest.mark.parametrize("junk", [7.0, jnp.nan])
@@ -213,51 +215,34 @@ def test_new_landmarks_respect_fresh_and_a_full_map(logs):
     _, info = slam.run(CONFIG, NOISE, start(), told)
     np.testing.assert_array_equal(info.id[0], [0, 1, 2, 3, *[-1] * 5])
     np.testing.assert_array_equal(info.id[1], [*range(8), -1])
-    small = CONFIG._replace(landmarks=5)
-    belief = slam.init(small, jnp.zeros(3))
+    belief = slam.init(SMALL, jnp.zeros(3))
     for t in range(3):
-        belief, info = stepped(small, NOISE, belief, at(told, t))
+        belief, info = stepped(SMALL, NOISE, belief, at(told, t))
     np.testing.assert_array_equal(info.id, [*range(5), *[-1] * 4])
     np.testing.assert_array_equal(info.slot[5:], 5)
     assert belief.next_id == 5 and np.isfinite(belief.cov).all()
 
 
 def test_only_the_kinds_of_the_config_are_used(logs):
-    only = CONFIG._replace(kinds=(NODE,), confirm=1)
-    belief, info = start(), None
+    _, told = drive(0, only=lambda t: [0, 3, 6, 7])
+    belief = slam.init(SMALL, jnp.zeros(3))
     for t in range(2):
-        belief, info = stepped(only, NOISE, belief, at(logs[0][1], t))
-    np.testing.assert_array_equal(info.used, np.arange(M) < 3)
-    assert info.dof == 6
+        belief, info = stepped(SMALL, NOISE, belief, at(told, t))
+    np.testing.assert_array_equal(info.used, np.arange(M) < 2)
+    assert info.dof == 4 and belief.next_id == 2
 
 
-def test_the_whole_chain_runs_in_float32():
-    """Scans of Fig. 7 in the default precision of production; the filter close to float64."""
-    config = CONFIG._replace(landmarks=24, confirm=2)
-    rooms, pose = world.named("fig07"), np.array([2.2, 2.3, 2.0])
-    turn = np.array([0.0, 0.0, 0.1])
+def test_a_run_in_float32_is_close_to_float64(logs):
+    told = logs[0][1]
+    _, double = slam.run(CONFIG, NOISE, start(), told)
     with jax.enable_x64(False):
-        look = jax.jit(slam.front_end, static_argnums=0)
-        walls = world.World(jnp.asarray(rooms.walls, jnp.float32))
-        nodes = [
-            look(config, lidar.cast(walls, jnp.asarray(pose + t * turn, jnp.float32), config.lidar))
-            for t in range(4)
-        ]
-        assert nodes[0].xy.dtype == jnp.float32
-        nodes = jax.tree.map(lambda *x: np.stack(x), *nodes)
-
-    def run(dtype):
-        cast = lambda x: jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype)
-        told = jax.tree.map(cast, Inputs(np.outer(np.arange(4) > 0, turn), nodes))
-        noise = jax.tree.map(lambda x: cast(np.asarray(x)), NOISE)
-        belief, info = slam.run(config, noise, slam.init(config, jnp.asarray(pose, dtype)), told)
-        assert belief.cov.dtype == info.pose.dtype == info.nis.dtype == dtype
-        return jax.tree.map(np.asarray, info)
-
-    double = run(jnp.float64)
-    with jax.enable_x64(False):
-        single = run(jnp.float32)
+        cast = lambda x: jnp.asarray(
+            x, jnp.float32 if np.issubdtype(x.dtype, np.floating) else x.dtype
+        )
+        given = jax.tree.map(cast, (NOISE, start(jnp.float32), told))
+        belief, single = slam.run(CONFIG, *given)
+        assert belief.cov.dtype == single.pose.dtype == single.nis.dtype == jnp.float32
     np.testing.assert_array_equal(single.slot, double.slot)
     assert double.used.any() and single.finite.all()
     np.testing.assert_allclose(single.pose, double.pose, atol=1e-5)
-    np.testing.assert_allclose(single.pose_cov, double.pose_cov, atol=1e-6)
+    np.testing.assert_allclose(single.pose_cov, double.pose_cov, atol=1e-7)

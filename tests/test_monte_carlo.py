@@ -1,0 +1,160 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import monte_carlo, motion, plan, slam, world
+from jaxslam.geometry import between, wrap_angle
+from jaxslam.grid import GridSpec
+from jaxslam.lidar import Lidar
+from jaxslam.monte_carlo import Track
+from jaxslam.motion import Robot
+
+STEPS = 6
+CONFIG = slam.Config(
+    lidar=Lidar(beams=181, step=np.pi / 180),
+    grid=GridSpec(ahead=5.0, side=4.0),
+    landmarks=16,
+    matches=4,
+)
+ROBOT = Robot()
+KEY = jax.random.key(5)
+PATH = plan.densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)]))
+
+
+def experiment(runs, threads):
+    parts = monte_carlo.experiment(
+        KEY,
+        CONFIG,
+        slam.wheel_noise(ROBOT),
+        world.World(jnp.asarray(world.named("fig07").walls)),
+        ROBOT,
+        jnp.asarray(PATH),
+        runs=runs,
+        steps=STEPS,
+        threads=threads,
+    )
+    return list(parts)
+
+
+@pytest.fixture(scope="module")
+def nine():
+    return experiment(9, threads=2)
+
+
+def equal(one, two):
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+
+
+def test_runs_do_not_depend_on_their_number_nor_on_threads(nine):
+    many, few = monte_carlo.collect(nine), monte_carlo.collect(experiment(6, threads=1))
+    equal(jax.tree.map(lambda x: x[:6], many), few)
+    assert len(np.unique(many.truth[:, -1, 0])) == 9
+
+
+def test_experiment_yields_the_runs_in_order(nine):
+    assert [len(part.truth) for part in nine] == [4, 4, 1]
+    keys = jax.vmap(lambda k: jax.random.split(k)[0])(
+        jnp.stack([jax.random.fold_in(KEY, i) for i in range(9)])
+    )
+    truth, _ = driven(keys, STEPS)
+    np.testing.assert_allclose(monte_carlo.collect(nine).truth, truth, atol=1e-12)
+
+
+def test_the_filter_finds_and_uses_landmarks(nine):
+    tracks = monte_carlo.collect(nine)
+    assert tracks.finite.all() and np.all(tracks.landmarks > 2)
+    assert np.all(tracks.matches[:, 2:] > 0)
+    summary = monte_carlo.evaluate(tracks)
+    assert summary["runs"] == 9 and summary["scans"] == 9 * STEPS and summary["diverged"] == 0
+    assert summary["position_rmse_m"] < 0.03
+
+
+@pytest.mark.parametrize("count, size", [(7, 3), (6, 3), (2, 5), (1, 1)])
+def test_map_batches_equals_vmap(count, size):
+    items = {"a": jnp.arange(3.0 * count).reshape(count, 3), "b": jnp.arange(count)}
+    function = lambda item: (item["a"].sum() * item["b"].astype(float), item["b"] + 1)
+    equal(monte_carlo.map_batches(function, items, size=size), jax.vmap(function)(items))
+
+
+def driven(keys, steps):
+    many = jax.vmap(lambda key: monte_carlo.drive(key, ROBOT, jnp.asarray(PATH), steps=steps))
+    return jax.tree.map(np.asarray, jax.jit(many)(keys))
+
+
+@pytest.fixture(scope="module")
+def steps():
+    return monte_carlo.drive_steps(ROBOT, PATH)
+
+
+@pytest.fixture(scope="module")
+def drives(steps):
+    return driven(jax.random.split(jax.random.key(1), 300), steps)
+
+
+def test_drives_stay_near_the_path_and_reach_its_end(drives):
+    truth, _ = drives
+    gap = np.linalg.norm(truth[:, :, None, :2] - PATH, axis=-1).min(axis=-1)
+    assert gap.max() < 0.2
+    assert np.linalg.norm(truth[:, -1, :2] - PATH[-1], axis=-1).max() < 0.35  # one stride
+
+
+def test_drive_steps_is_the_noise_free_length(steps):
+    still = ROBOT._replace(wheel_noise=0.0)
+    truth, told = jax.jit(
+        lambda key: monte_carlo.drive(key, still, jnp.asarray(PATH), steps=steps + 2)
+    )(KEY)
+    np.testing.assert_array_equal(np.any(told != 0, axis=1)[1:], np.arange(steps + 1) < steps - 1)
+    np.testing.assert_allclose(monte_carlo.dead_reckoning(truth[0], told), truth, atol=1e-12)
+
+
+def test_encoders_have_the_noise_they_promise(drives):
+    """A wheel that rolls w errs by k sqrt(|w|), independent of the other; 5 standard errors."""
+    truth, told = drives
+    moves = jax.vmap(between)(truth[:, :-1].reshape(-1, 3), truth[:, 1:].reshape(-1, 3))
+    told = told[:, 1:].reshape(-1, 3)
+    said = np.stack(jax.vmap(motion.wheels, (0, None))(jnp.asarray(told), ROBOT.base))
+    rolls = np.all(np.abs(said) > 0, axis=0)
+    variance = ROBOT.wheel_noise**2 * np.abs(said).sum(axis=0)[rolls]
+    turn = np.asarray(wrap_angle(moves[:, 2] - told[:, 2]))[rolls]
+    rolled = np.stack(jax.vmap(motion.wheels, (0, None))(moves, ROBOT.base))
+    forward = np.mean(rolled - said, axis=0)[rolls]
+    count = rolls.sum()
+    assert count > 5000
+    for error, spread in [(turn, variance / ROBOT.base**2), (forward, variance / 4)]:
+        z = error / np.sqrt(spread)
+        assert abs(np.mean(z)) < 5 / np.sqrt(count)
+        assert abs(np.mean(z**2) - 1) < 5 * np.sqrt(2 / count)
+
+
+def track(final, *, finite=True, nan=False):
+    """A run of two scans whose last estimate is `final` [m] off, dead reckoning twice that."""
+    estimate = np.zeros((2, 3))
+    estimate[1, 0] = np.nan if nan else final
+    odometry = np.zeros((2, 3))
+    odometry[1, 0] = 2 * final
+    return Track(
+        truth=np.zeros((2, 3)),
+        estimate=estimate,
+        cov=np.stack([np.zeros((3, 3)), np.diag([0.04, 0.04, 0.01])]),
+        odometry=odometry,
+        matches=np.array([0, 3], np.int32),
+        landmarks=np.int32(4),
+        finite=np.bool_(finite),
+    )
+
+
+def test_evaluate_counts_diverged_and_nonfinite_runs_and_masks_the_latter():
+    runs = [track(0.2), track(1.5), track(0.0, nan=True), track(0.0, finite=False), track(-0.4)]
+    summary = monte_carlo.evaluate(jax.tree.map(lambda *x: np.stack(x), *runs))
+    good = np.array([0.2, 1.5, -0.4])
+    assert summary["runs"] == 5 and summary["diverged_runs"] == [1, 2, 3]
+    assert summary["diverged"] == 3 and summary["dead_reckoning"]["diverged"] == 1
+    assert summary["position_rmse_m"] == pytest.approx(np.sqrt(np.mean(good**2) / 2))
+    assert summary["heading_rmse_deg"] == 0
+    # The certain first pose has no NEES.
+    assert summary["nees"] == pytest.approx(np.mean(good**2 / 0.04) / 3)
+    assert summary["landmarks"] == 4 and summary["matches"] == 1.5
+    assert summary["dead_reckoning"]["position_rmse_m"] == pytest.approx(
+        2 * summary["position_rmse_m"]
+    )

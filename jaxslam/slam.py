@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxslam import association, edges, ekf, nodes, topomap, voronoi
@@ -61,7 +62,7 @@ class Config(NamedTuple):
     wall_apart: float = 0.26  # [rad] likewise between wall directions
     alike_shape: float = 0.3  # logarithm of the ratio of clearances
     alike_turn: float = 0.5  # [rad] between directions of corners
-    confirm: int = 2  # sightings from which a landmark counts
+    confirm: int = 3  # sightings from which a landmark counts
     wall_confirm: int = 4  # likewise a wall direction: most scans show one, and a wrong one harms
     patience: int = 40  # steps after which an unconfirmed one is dropped
 
@@ -262,7 +263,8 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
     seen, links = local_maps(config, scans)
     belief, info = run(config, noise, init(config, start), Inputs(motions, seen))
     arcs = _arcs(info, links, arcs=2 * config.landmarks)
-    return Survey(belief, info, seen, topomap.graph(belief, arcs, confirm=config.confirm))
+    graph = topomap.graph(belief, arcs, np.asarray(info.pose), confirm=config.confirm)
+    return Survey(belief, info, seen, graph)
 
 
 def wheel_noise(robot: Robot) -> Noise:

@@ -35,7 +35,7 @@ class Graph(NamedTuple):
     clearance: np.ndarray  # (N,) [m] of a node, 0 for a corner
     pairs: np.ndarray  # (A, 2) int, indices of the two ends
     length: np.ndarray  # (A,) [m]
-    arc_clearance: np.ndarray  # (A,) [m]
+    arc_clearance: np.ndarray  # (A,) [m], NaN where it was driven but not seen
     via: np.ndarray  # (A, 2) [m] a point half-way
 
 
@@ -87,8 +87,45 @@ def build(ids: Array, poses: Array, links: Links, *, arcs: int) -> Arcs:
     return lax.scan(body, empty(arcs=arcs), (ids, poses, links))[0]
 
 
-def graph(belief: Belief, arcs: Arcs, *, confirm: int) -> Graph:
-    """The map as it stands: landmarks that count, and the arcs between them."""
+def trail(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> dict:
+    """Pairs of nodes that the robot drove between, with the point half-way between them.
+
+    The robot is at a node while it is inside its circle, at the nearest where circles overlap.
+
+    Args:
+        xy: (N, 2) [m] positions of the nodes.
+        clearance: (N,) [m] radii of their circles.
+        poses: (T, 3) where the robot was.
+
+    Returns:
+        Dict of pairs (the smaller index first) to the point (2,) [m, world].
+    """
+    found: dict[tuple[int, int], np.ndarray] = {}
+    here, since = -1, 0
+    for step, pose in enumerate(np.asarray(poses, float)):
+        away = np.linalg.norm(xy - pose[:2], axis=1)
+        inside = np.where(away < clearance, away, np.inf)
+        now = int(np.argmin(inside)) if np.isfinite(inside).any() else -1
+        if now >= 0 and here >= 0 and now != here:
+            middle = np.asarray(poses[(since + step) // 2, :2], float)
+            found.setdefault((min(here, now), max(here, now)), middle)
+        if now >= 0:
+            here, since = now, step
+    return found
+
+
+def graph(belief: Belief, arcs: Arcs, poses: np.ndarray, *, confirm: int) -> Graph:
+    """The map as it stands: landmarks that count, and the arcs between them.
+
+    Two nodes are joined by an arc where a branch of a scan's diagram joins them, and where the
+    robot drove from one to the other; the clearance of the latter is NaN, it was not measured.
+
+    Args:
+        belief: The landmarks.
+        arcs: Branches seen.
+        poses: (T, 3) estimated poses of the scans.
+        confirm: Sightings from which a landmark counts.
+    """
     seen, kind, id = (np.asarray(x) for x in (belief.seen, belief.kind, belief.id))
     keep = np.flatnonzero((seen >= confirm) & np.isin(kind, (NODE, CORNER)))
     xy = np.asarray(belief.places, float)[keep]
@@ -101,14 +138,22 @@ def graph(belief: Belief, arcs: Arcs, *, confirm: int) -> Graph:
     pairs = np.array([u[:2] for u in used], int).reshape(-1, 2)
     at = [u[2] for u in used]
     via = np.asarray(arcs.via, float)[at].reshape(-1, 2)
+    room = np.asarray(arcs.clearance, float)[at]
+    clearance = np.where(kind[keep] == NODE, np.asarray(belief.shape, float)[keep], 0.0)
+    seen_pairs = {tuple(sorted(pair)) for pair in pairs.tolist()}
+    driven = {k: v for k, v in trail(xy, clearance, poses).items() if k not in seen_pairs}
+    if driven:
+        pairs = np.concatenate([pairs, np.array(list(driven))])
+        via = np.concatenate([via, np.array(list(driven.values()))])
+        room = np.concatenate([room, np.full(len(driven), np.nan)])
     length = sum(np.linalg.norm(xy[pairs[:, k]] - via, axis=1) for k in range(2))
     return Graph(
         id=id[keep],
         xy=xy,
         kind=kind[keep],
-        clearance=np.where(kind[keep] == NODE, np.asarray(belief.shape, float)[keep], 0.0),
+        clearance=clearance,
         pairs=pairs,
         length=length,
-        arc_clearance=np.asarray(arcs.clearance, float)[at],
+        arc_clearance=room,
         via=via,
     )

@@ -1,0 +1,178 @@
+"""From S to F and back: the robot steers by its own estimate, home on its own map (Figs. 11-12).
+
+On the way out the robot follows way points from S to F, localised by the landmarks it finds. Its
+map then holds nodes and arcs; the way home is the shortest route over them. Nothing but the
+simulated scans and encoder readings reaches the robot: it never knows its true pose.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from experiments import common
+from jaxslam import lidar, monte_carlo, motion, plan, slam, topomap
+from jaxslam.geometry import compose
+from jaxslam.metrics import pose_error
+from jaxslam.motion import Robot
+from jaxslam.types import NODE
+
+POINTS = 2000  # of a path, filled up with its end
+STEPS = 380  # scans of a leg at most
+CONFIG = slam.Config()
+
+
+def padded(path: np.ndarray) -> jnp.ndarray:
+    """Path (POINTS, 2) that stays at the end of a path (N, 2)."""
+    return jnp.asarray(np.concatenate([path, np.repeat(path[-1:], POINTS - len(path), 0)]), float)
+
+
+@partial(jax.jit, static_argnames="robot")
+def leg(key, robot: Robot, place, noise: slam.Noise, path, truth, belief):
+    """Follow `path` by the belief, from a true pose (3,); all scans are of where the robot is."""
+
+    def step(now, key):
+        truth, belief, at = now
+        roll_key, scan_key = jax.random.split(key)
+        told, at = plan.follow(path, at, belief.pose)
+        draws = jax.random.normal(roll_key, (monte_carlo.SUBSTEPS, 2), path.dtype)
+        truth = compose(truth, motion.roll(robot, draws, told))
+        scan = lidar.disturb(scan_key, lidar.cast(place, truth, CONFIG.lidar), CONFIG.lidar)
+        seen, links = slam.local_map(CONFIG, scan)
+        belief, info = slam.step(CONFIG, noise, belief, slam.Inputs(told, seen))
+        return (truth, belief, at), (truth, told, info, links)
+
+    start = (truth, belief, jnp.int32(0))
+    (truth, belief, _), (truths, told, info, links) = jax.lax.scan(
+        step, start, jax.random.split(key, STEPS)
+    )
+    return truth, belief, truths, told, info, links
+
+
+def way_home(graph: topomap.Graph, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Shortest way (K, 2) from `start` (2,) to `goal` (2,) over the largest part of the map."""
+    size = len(graph.xy)
+    joined = coo_matrix((np.ones(len(graph.pairs)), graph.pairs.T), shape=(size, size))
+    part = connected_components(joined, directed=False)[1]
+    nodes = np.flatnonzero(part == np.argmax(np.bincount(part)))
+    nearest = lambda place: nodes[np.argmin(np.linalg.norm(graph.xy[nodes] - place, axis=1))]
+    route = plan.route(graph.xy, graph.pairs, graph.length, nearest(start), nearest(goal))
+    points = [start]
+    for a, b in zip(route[:-1], route[1:], strict=True):
+        arcs = [k for k, pair in enumerate(graph.pairs.tolist()) if set(pair) == {a, b}]
+        arc = min(arcs, key=lambda k: graph.length[k])
+        points += [graph.xy[a], graph.via[arc]]
+    return np.array([*points, graph.xy[route[-1]], goal])
+
+
+def clearance(walls: np.ndarray, places: np.ndarray) -> float:
+    """Smallest distance [m] of places (N, 2) from walls (S, 4)."""
+    start, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    offset = places[:, None] - start
+    part = np.clip(np.sum(offset * along, -1) / np.sum(along**2, -1), 0.0, 1.0)
+    return float(np.linalg.norm(offset - part[..., None] * along, axis=-1).min())
+
+
+def compute(seed: int) -> common.Numbers:
+    """Drive out and home; what happened, what the robot believed, and its map."""
+    place, robot, tour, _ = common.scene()
+    noise, walls = slam.wheel_noise(robot), np.asarray(place.walls, float)
+    out_key, home_key = jax.random.split(jax.random.key(seed))
+    first = monte_carlo.start(tour)
+    belief = slam.init(CONFIG, first)
+    truth, legs = first, []
+    arcs = topomap.empty(arcs=2 * CONFIG.landmarks)
+    path, blind = np.asarray(tour), first
+    for name, key in (("out", out_key), ("home", home_key)):
+        truth, belief, truths, told, info, links = leg(
+            key, robot, place, noise, padded(path), truth, belief
+        )
+        still = np.all(np.asarray(told) == 0.0, axis=1)
+        moved = int(np.argmax(still)) if still.any() else STEPS  # it stops at the end of its path
+        cut = lambda tree: jax.tree.map(lambda x: x[:moved], tree)  # noqa: B023
+        truths, told, info, links = cut((truths, told, info, links))
+        odometry = monte_carlo.dead_reckoning(blind, told)
+        error = np.asarray(pose_error(info.pose, truths))
+        arcs = merge(arcs, info, links)
+        legs.append(
+            {
+                "leg": name,
+                "path": path,
+                "truth": truths,
+                "estimate": info.pose,
+                "odometry": odometry,
+                "scans": moved,
+                "length_m": float(np.linalg.norm(np.diff(truths[:, :2], axis=0), axis=1).sum()),
+                **monte_carlo.errors(error),
+                "final_error_m": float(np.hypot(*error[-1, :2])),
+                "from_goal_m": float(np.hypot(*(np.asarray(truths)[-1, :2] - path[-1]))),
+                "odometry_final_error_m": float(np.hypot(*(odometry - truths)[-1, :2])),
+                "wall_clearance_m": clearance(walls, np.asarray(truths)[:, :2]),
+            }
+        )
+        poses = np.concatenate([np.asarray(one["estimate"]) for one in legs])
+        graph = topomap.graph(belief, arcs, poses, confirm=CONFIG.confirm)
+        if name == "out":
+            goal = np.asarray(tour, float)[0]
+            path = plan.densify(way_home(graph, np.asarray(belief.pose, float)[:2], goal))
+        blind = odometry[-1]
+    return {"seed": seed, "legs": legs, "map": graph._asdict(), "walls": walls}
+
+
+@jax.jit
+def merge(arcs: topomap.Arcs, info: slam.Info, links) -> topomap.Arcs:
+    """Add the links of a leg to the map."""
+    body = lambda arcs, now: (topomap.add(arcs, *now), None)
+    return jax.lax.scan(body, arcs, (info.id, info.pose, links))[0]
+
+
+def draw(numbers: common.Numbers, path: Path) -> None:
+    """The world, both legs, and the map."""
+    figure, axes = common.canvas(9, 7.2, 1, 1)
+    axis = axes[0, 0]
+    for x1, y1, x2, y2 in numbers["walls"]:
+        axis.plot([x1, x2], [y1, y2], color=common.BLACK, linewidth=1)
+    graph = {key: np.array(value) for key, value in numbers["map"].items()}
+    for k, ((i, j), via) in enumerate(zip(graph["pairs"], graph["via"], strict=True)):
+        line = np.array([graph["xy"][i], via, graph["xy"][j]])
+        label = "arcs of the map" if k == 0 else None
+        axis.plot(*line.T, color=common.SKY, linewidth=1.2, label=label)
+    for one, colour in zip(numbers["legs"], (common.RED, common.BLUE), strict=True):
+        estimate, truth = np.array(one["estimate"]), np.array(one["truth"])
+        label = f"estimate, {one['leg']}"
+        axis.plot(*estimate[:, :2].T, color=colour, linewidth=1.6, label=label)
+        label = "true path" if one["leg"] == "home" else None
+        axis.plot(*truth[:, :2].T, color=common.GREEN, linestyle=":", linewidth=2, label=label)
+    nodes = graph["kind"] == NODE
+    axis.plot(*graph["xy"][nodes].T, "o", color=common.RED, markersize=5, label="nodes")
+    axis.plot(*graph["xy"][~nodes].T, "s", color=common.PINK, fillstyle="none", label="corners")
+    odometry = np.concatenate([np.array(one["odometry"]) for one in numbers["legs"]])
+    axis.plot(*odometry[:, :2].T, color=common.ORANGE, linewidth=0.8, label="dead reckoning")
+    first, last = numbers["legs"][0]["truth"][0], numbers["legs"][0]["truth"][-1]
+    for name, pose in (("S", first), ("F", last)):
+        axis.annotate(name, pose[:2], fontsize=14, fontweight="bold", color=common.BLACK)
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axis.set(xlim=(-1, 21.5), ylim=(-1.5, 16.5))
+    figure.legend(loc="outside lower center", ncols=4)
+    figure.savefig(path)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the experiment."""
+    given = common.parse(__doc__, argv)
+    numbers = compute(given.seed)
+    common.save(given.out, "fig12_slam", numbers, draw)
+    for one in numbers["legs"]:
+        print(
+            f"{one['leg']:5} {one['length_m']:.1f} m, {one['scans']} scans: position RMSE"
+            f" {one['position_rmse_m']:.3f} m, heading {one['heading_rmse_deg']:.2f} deg, ends"
+            f" {one['from_goal_m']:.2f} m from its goal, {one['wall_clearance_m']:.2f} m clear"
+        )
+
+
+if __name__ == "__main__":
+    main()

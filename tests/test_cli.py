@@ -13,7 +13,7 @@ from evo.core import sync
 from evo.tools import file_interface
 
 import jaxslam
-from jaxslam import cli, geometry, lidar, world
+from jaxslam import cli, geometry, lidar, report, world
 from jaxslam.io import carmen, tum
 
 # The commands run in processes of their own, in float32 as users run them; a short drive and
@@ -76,7 +76,7 @@ def done(tmp_path_factory):
     tum.write(place / "reference.tum", stamps, poses)
     steps = zip(stamps[:-1], stamps[1:], drive()[0][:-1], drive()[0][1:], strict=True)
     lines = [
-        f"{a} {b} {' '.join(map(str, cli._seen_from(p, q)[:2]))} 0 0 0 {cli._seen_from(p, q)[2]}"
+        f"{a} {b} {' '.join(map(str, report.seen_from(p, q)[:2]))} 0 0 0 {report.seen_from(p, q)[2]}"
         for a, b, p, q in steps
     ]
     (place / "pairs.relations").write_text("\n".join(lines) + "\n")
@@ -300,5 +300,5 @@ def test_the_package_exports_what_it_says_and_not_much():
 
 def test_poses_seen_from_others_agree_with_geometry():
     a, b = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, -2.0]]), np.array([[0.0, 5.0, -3.0], [1.0, 1, 1]])
-    expected = jax.vmap(geometry.compose)(a, jnp.asarray(cli._seen_from(a, b)))
+    expected = jax.vmap(geometry.compose)(a, jnp.asarray(report.seen_from(a, b)))
     np.testing.assert_allclose(expected, b, atol=1e-12)

@@ -1,0 +1,208 @@
+"""What the command line makes of a result: numbers, files, pictures and a summary."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam import lidar, metrics
+from jaxslam.io import geojson, tum
+from jaxslam.io.output import write_json
+from jaxslam.io.recording import Recording
+from jaxslam.io.relations import Relations
+from jaxslam.lidar import Scan
+from jaxslam.monte_carlo import Track
+from jaxslam.slam import Config, Survey
+from jaxslam.topomap import Graph
+from jaxslam.types import NODE
+from jaxslam.world import World
+
+KINDS = ("node", "corner", "wall")
+
+Numbers = dict[str, Any]
+"""What `metrics.json` holds."""
+
+Trajectory = tuple[np.ndarray, np.ndarray]
+"""Times (N,) [s] and poses (N, 3)."""
+
+
+def poses_of(survey: Survey) -> np.ndarray:
+    """Estimated poses (T, 3) float64."""
+    return np.asarray(survey.info.pose, np.float64)
+
+
+def error_of(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Errors (..., 3) [m, m, rad] of poses (..., 3), world frame."""
+    return np.asarray(metrics.pose_error(jnp.asarray(poses, float), jnp.asarray(truth, float)))
+
+
+def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) in the frames of others (..., 3): `geometry.between` in float64."""
+    c, s = np.cos(frames[..., 2]), np.sin(frames[..., 2])
+    x, y, turn = np.moveaxis(poses - frames, -1, 0)
+    turn = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
+    return np.stack([c * x + s * y, c * y - s * x, turn], axis=-1)
+
+
+def length(poses: np.ndarray) -> float:
+    """Length [m] of the way along poses (T, 3)."""
+    return float(np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+
+
+def aligned_error(tracks: Track) -> float | None:
+    """Position RMSE [m] over runs, each aligned as a whole; None if none is finite."""
+    stamps = np.arange(tracks.truth.shape[1])
+    squares = [
+        metrics.ate(stamps, estimate, stamps, truth)["ate_rmse_m"] ** 2
+        for estimate, truth in zip(tracks.estimate, tracks.truth, strict=True)
+        if np.isfinite(estimate).all()
+    ]
+    return float(np.sqrt(np.mean(squares))) if squares else None
+
+
+def against_reference(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> Numbers:
+    """Errors of poses (T, 3) after rigid alignment with a reference."""
+    numbers = metrics.ate(times, poses, *known)
+    i, j = metrics.match_times(times, known[0]).T
+    frame = metrics.align(poses[i, :2], known[1][j, :2])
+    turn = seen_from(seen_from(frame, known[1][j]), poses[i])[:, 2]
+    numbers["heading_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(turn**2))))
+    return numbers
+
+
+def against_relations(recording: Recording, poses: np.ndarray, verified: Relations) -> Numbers:
+    """Errors of poses (T, 3) in verified relative poses."""
+    wheels = recording.wheel_times, recording.wheel_poses
+    return {"relations": metrics.relations_error(recording.times, poses, *wheels, verified)}
+
+
+def beside(
+    times: np.ndarray, poses: np.ndarray, known: Trajectory
+) -> tuple[np.ndarray, np.ndarray]:
+    """A reference, aligned with poses (T, 3), and their error since the start.
+
+    Returns:
+        The reference (K, 3) in the frame of the map, aligned as a whole, and the errors (T, 3)
+        to the reference laid on the first pose they share, NaN where it has none.
+    """
+    i, j = metrics.match_times(times, known[0]).T
+    frame = metrics.align(poses[i, :2], known[1][j, :2])
+    zero = np.zeros(3)
+    first = seen_from(seen_from(known[1][j[0]], zero), seen_from(poses[i[0]], zero))
+    error = np.full(poses.shape, np.nan)
+    error[i] = error_of(poses[i], seen_from(first, known[1][j]))
+    return seen_from(frame, known[1][j]), error
+
+
+def write(place: Path, numbers: Numbers, times: np.ndarray, survey: Survey) -> None:
+    """Write the files of numbers that every command has."""
+    write_json(place / "metrics.json", numbers)
+    tum.write(place / "trajectory.tum", times, poses_of(survey))
+    _write_map(place / "map.geojson", survey.graph)
+
+
+def _write_map(path: Path, graph: Graph) -> None:
+    """Write a topological map."""
+    nodes = [
+        geojson.Node(int(id), float(x), float(y), KINDS[kind], float(c) if kind == NODE else np.nan)
+        for id, (x, y), kind, c in zip(*graph[:2], graph.kind, graph.clearance, strict=True)
+    ]
+    arcs = [
+        geojson.Arc(
+            k,
+            int(graph.id[a]),
+            int(graph.id[b]),
+            float(graph.length[k]),
+            float(graph.arc_clearance[k]),
+            np.stack([graph.xy[a], graph.via[k], graph.xy[b]]),
+        )
+        for k, (a, b) in enumerate(graph.pairs)
+    ]
+    geojson.write(path, nodes, arcs)
+
+
+def draw(
+    place: Path,
+    config: Config,
+    survey: Survey,
+    lines: dict[str, np.ndarray],
+    error: np.ndarray | None,
+    *,
+    world: World | None = None,
+    scans: Scan | None = None,
+) -> None:
+    """Draw path.png and errors.png.
+
+    Args:
+        place: Folder to write to.
+        config: Of the survey.
+        survey: What to draw.
+        lines: Trajectories (N, 3) beside the estimate, by the names in `plot.LINES`.
+        error: (T, 3) errors, if they are known.
+        world: Walls to draw.
+        scans: Scans [T] to draw.
+    """
+    from jaxslam import plot  # matplotlib takes its time to load
+
+    poses = poses_of(survey)
+    walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
+    shown = [poses, survey.graph.xy, *lines.values(), *walls]
+    figure, axis = plot.plan(*plot.extent(*shown))
+    if world is not None:
+        plot.walls(axis, world)
+    if scans is not None:
+        ends = jax.vmap(lidar.points, in_axes=(0, None))(scans, config.lidar)
+        plot.echoes(axis, poses, np.asarray(ends), np.asarray(scans.hit))
+    for what, line in (lines | {"estimate": poses}).items():
+        plot.trajectory(axis, line, what)
+    plot.arcs(axis, survey.graph)
+    plot.landmarks(axis, survey.belief, confirm=config.confirm)
+    plot.ends(axis, poses)
+    plot.legend(figure)
+    figure.savefig(place / "path.png")
+
+    figure, axes = plot.canvas(9.0, 6.0, 3)
+    plot.errors(axes[:, 0], np.asarray(survey.info.pose_cov), error)
+    figure.savefig(place / "errors.png")
+
+
+ROWS = (
+    ("position_rmse_m", "position RMSE", "m"),
+    ("heading_rmse_deg", "heading RMSE", "deg"),
+    ("ate_rmse_m", "position RMSE, aligned", "m"),
+    ("translation_mean_m", "error of relations", "m"),
+    ("rotation_mean_deg", "error of relations", "deg"),
+)
+
+
+def tell(numbers: Numbers, title: str, out: Path) -> None:
+    """Print a summary of what `metrics.json` holds."""
+    print(f"\n{title}; a way of {numbers['path_length_m']:.0f} m")
+    if numbers.get("skipped_lines"):
+        print(f"{numbers['skipped_lines']} broken lines of the log were skipped")
+    blind = numbers.get("dead_reckoning", {})
+    slam_has, wheels_have = (
+        numbers | numbers.get("relations", {}),
+        blind | blind.get("relations", {}),
+    )
+    if blind:
+        print(f"{'':32}{'SLAM':>10}{'odometry':>10}{'ratio':>8}")
+    for key, name, unit in ROWS:
+        if key in slam_has and slam_has[key] is not None:
+            line = f"  {f'{name} [{unit}]':30}{slam_has[key]:10.3f}"
+            if key in wheels_have:
+                ratio = wheels_have[key] / slam_has[key] if slam_has[key] else np.inf
+                line += f"{wheels_have[key]:10.3f}{ratio:8.1f}"
+            print(line)
+    if "diverged" in numbers:
+        print(f"  {'diverged runs':30}{numbers['diverged']:10d}{blind['diverged']:10d}")
+    if numbers.get("nees") is not None:
+        print(f"  {'NEES / 3, about 1 if consistent':30}{numbers['nees']:9.3f}")
+    print(f"  {'landmarks':30}{numbers['landmarks']:10.0f}")
+    print(f"  {'matches a scan':30}{numbers['matches']:10.1f}")
+    seconds = numbers["seconds"]
+    print(f"  {'seconds':30}{seconds['run']:10.1f}, and {seconds['compile']:.1f} to compile")
+    print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")

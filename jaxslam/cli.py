@@ -29,6 +29,7 @@ from jaxslam.types import NODE
 from jaxslam.world import World
 
 LANDMARKS = 256  # room for those of a recorded log
+CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 `jaxslam COMMAND --help` lists the options of a command, `jaxslam --version` prints the version."""
 
@@ -132,7 +133,7 @@ def run(
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
     assumed = _noise(noise, slam.log_noise())
-    config = Config(lidar=recording.lidar, landmarks=LANDMARKS)
+    config = Config(lidar=recording.lidar, landmarks=LANDMARKS, confirm=CONFIRM)
     wheels = report.seen_from(recording.odometry[0], recording.odometry)
     with _named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)

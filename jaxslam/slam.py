@@ -62,7 +62,7 @@ class Config(NamedTuple):
     wall_apart: float = 0.26  # [rad] likewise between wall directions
     alike_shape: float = 0.3  # logarithm of the ratio of clearances
     alike_turn: float = 0.5  # [rad] between directions of corners
-    confirm: int = 3  # sightings from which a landmark counts
+    confirm: int = 2  # sightings from which a landmark counts
     wall_confirm: int = 4  # likewise a wall direction: most scans show one, and a wrong one harms
     patience: int = 40  # steps after which an unconfirmed one is dropped
 
@@ -269,7 +269,7 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
 
 def wheel_noise(robot: Robot) -> Noise:
     """Noise of a simulated robot: its encoders, and how well the front end finds landmarks."""
-    return _noise(wheel_coefficients(robot), range=0.006, bearing=0.003, scale=1.0, wall=0.002)
+    return _noise(wheel_coefficients(robot), range=0.01, bearing=0.005, scale=1.0, wall=0.0005)
 
 
 def log_noise() -> Noise:

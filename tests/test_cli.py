@@ -75,10 +75,7 @@ def done(tmp_path_factory):
     stamps, (poses, _) = np.arange(SCANS) + 0.5, drive()
     tum.write(place / "reference.tum", stamps, poses)
     steps = zip(stamps[:-1], stamps[1:], drive()[0][:-1], drive()[0][1:], strict=True)
-    lines = [
-        f"{a} {b} {' '.join(map(str, report.seen_from(p, q)[:2]))} 0 0 0 {report.seen_from(p, q)[2]}"
-        for a, b, p, q in steps
-    ]
+    lines = ["{} {} {} {} 0 0 0 {}".format(a, b, *report.seen_from(p, q)) for a, b, p, q in steps]
     (place / "pairs.relations").write_text("\n".join(lines) + "\n")
     options = ["--reference", place / "reference.tum", "--relations", place / "pairs.relations"]
     simulated = begin(

@@ -152,7 +152,7 @@ def run(
             "scans": len(poses),
             "skipped_lines": recording.skipped,
             "path_length_m": report.length(wheels),
-            "landmarks": int(np.sum(np.asarray(survey.belief.seen) >= config.confirm)),
+            "landmarks": int(np.sum(survey.belief.seen >= slam.needed(config, survey.belief.kind))),
             "matches": float(np.mean(np.sum(np.asarray(survey.info.used), axis=1))),
             "seconds": seconds,
         }

@@ -169,7 +169,7 @@ def track(config: Config, noise: Noise, log: Log) -> Track:
         cov=info.pose_cov,
         odometry=dead_reckoning(log.truth[0], log.motion),
         matches=jnp.sum(info.used, axis=1, dtype=jnp.int32),
-        landmarks=jnp.sum(belief.seen >= config.confirm, dtype=jnp.int32),
+        landmarks=jnp.sum(belief.seen >= slam.needed(config, belief.kind), dtype=jnp.int32),
         finite=jnp.all(info.finite),
     )
 
@@ -257,7 +257,9 @@ def evaluate(tracks: Track) -> dict:
 
 
 def errors(error: np.ndarray) -> dict:
-    """RMSE of position [m] and heading [deg] over pose errors (..., 3)."""
+    """RMSE of position [m] and heading [deg] over pose errors (..., 3); None of no errors."""
+    if error.size == 0:
+        return {"position_rmse_m": None, "heading_rmse_deg": None}
     return {
         "position_rmse_m": float(np.sqrt(np.mean(np.sum(error[..., :2] ** 2, axis=-1)))),
         "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(error[..., 2] ** 2)))),

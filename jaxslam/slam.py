@@ -149,6 +149,11 @@ def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
     return jnp.where((nodes.kind == WALL)[:, None, None], wall, point)
 
 
+def needed(config: Config, kind: Array) -> Array:
+    """Sightings (...) from which landmarks of these kinds (...) count."""
+    return jnp.where(kind == WALL, config.wall_confirm, config.confirm)
+
+
 def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Array) -> Array:
     """Features (M,) bool that are far from all landmarks of their kind."""
     same = (nodes.kind[:, None] == belief.kind[None]) & (belief.seen > 0)[None]
@@ -178,8 +183,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     distance = lax.stop_gradient(ekf.distances(before, seen, r))
     possible = ekf.alike(before, seen, shape=config.alike_shape, turn=config.alike_turn)
     slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
-    needed = jnp.where(seen.kind == WALL, config.wall_confirm, config.confirm)
-    counts = before.seen.at[slot].get(mode="fill", fill_value=0) + 1 >= needed
+    sightings = before.seen.at[slot].get(mode="fill", fill_value=0) + 1
+    counts = sightings >= needed(config, seen.kind)
     used = (slot < size) & counts
     # A few rows suffice: wall directions first, then as the front end ordered them.
     urgency = jnp.where(used, jnp.where(seen.kind == WALL, 2, 1), 0)
@@ -191,8 +196,10 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     finite = jnp.all(jnp.isfinite(after.mean)) & jnp.isfinite(nis)
     after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
 
+    slot, used = jnp.where(finite, slot, size), used & finite
     after = ekf.note(after, seen, slot)
-    stale = (after.seen < config.confirm) & (after.step - after.last > config.patience)
+    unconfirmed = after.seen < needed(config, after.kind)
+    stale = unconfirmed & (after.step - after.last > config.patience)
     after = ekf.forget(after, stale)
     wanted = _new(config, before, seen, distance, slot) & finite
     after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh)

@@ -1,7 +1,11 @@
+import os
 from pathlib import Path
 
-import jax
-import pytest
+# Most of the time of these tests is XLA's optimiser, and what they run is small.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
+import jax  # noqa: E402, as the flag must be set first
+import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -190,6 +190,8 @@ def test_candidates_do_not_move_the_pose_before_they_are_confirmed(logs):
     first = CONFIG.confirm - 1
     assert np.all(info.id[1, :4] >= 0)  # they are matched, all the same
     assert not info.used[:first].any() and info.used[first, :4].all()
+    # The walls came with the second scan, and have to be seen more often.
+    np.testing.assert_array_equal(info.used[:, 6], np.arange(T) >= CONFIG.wall_confirm)
     np.testing.assert_allclose(info.pose[:first], blind[:first], atol=1e-12)
     assert np.linalg.norm(info.pose[first] - blind[first]) > 1e-4
 

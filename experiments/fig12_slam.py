@@ -26,13 +26,15 @@ STEPS = 380  # scans of a leg at most
 CONFIG = slam.Config()
 
 
-def padded(path: np.ndarray) -> jnp.ndarray:
-    """Path (POINTS, 2) that stays at the end of a path (N, 2)."""
-    return jnp.asarray(np.concatenate([path, np.repeat(path[-1:], POINTS - len(path), 0)]), float)
+def padded(path: np.ndarray) -> tuple[jnp.ndarray, jnp.ndarray]:
+    """A path (N, 2) filled up at its beginning to (POINTS, 2), and the index where it begins."""
+    spare = POINTS - len(path)
+    whole = np.concatenate([np.repeat(path[:1], spare, 0), path])
+    return jnp.asarray(whole, float), jnp.asarray(spare, jnp.int32)
 
 
 @partial(jax.jit, static_argnames="robot")
-def leg(key, robot: Robot, place, noise: slam.Noise, path, truth, belief):
+def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief):
     """Follow `path` by the belief, from a true pose (3,); all scans are of where the robot is."""
 
     def step(now, key):
@@ -46,7 +48,7 @@ def leg(key, robot: Robot, place, noise: slam.Noise, path, truth, belief):
         belief, info = slam.step(CONFIG, noise, belief, slam.Inputs(told, seen))
         return (truth, belief, at), (truth, told, info, links)
 
-    start = (truth, belief, jnp.int32(0))
+    start = (truth, belief, begin)
     (truth, belief, _), (truths, told, info, links) = jax.lax.scan(
         step, start, jax.random.split(key, STEPS)
     )
@@ -89,7 +91,7 @@ def compute(seed: int) -> common.Numbers:
     path, blind = np.asarray(tour), first
     for name, key in (("out", out_key), ("home", home_key)):
         truth, belief, truths, told, info, links = leg(
-            key, robot, place, noise, padded(path), truth, belief
+            key, robot, place, noise, *padded(path), truth, belief
         )
         still = np.all(np.asarray(told) == 0.0, axis=1)
         moved = int(np.argmax(still)) if still.any() else STEPS  # it stops at the end of its path

@@ -107,7 +107,8 @@ def trail(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> dict:
         inside = np.where(away < clearance, away, np.inf)
         now = int(np.argmin(inside)) if np.isfinite(inside).any() else -1
         if now >= 0 and here >= 0 and now != here:
-            middle = np.asarray(poses[(since + step) // 2, :2], float)
+            both = [(since + step) // 2, (since + step + 1) // 2]
+            middle = np.mean(np.asarray(poses, float)[both, :2], axis=0)
             found.setdefault((min(here, now), max(here, now)), middle)
         if now >= 0:
             here, since = now, step

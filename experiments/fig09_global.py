@@ -1,0 +1,337 @@
+"""Figs. 8 and 9 of the paper: the topological map of a room, grown scan by scan.
+
+The robot looks at the 6 m x 5 m room from ten places, goes from one to the next by its noisy
+odometry, and adds the local map of each scan to the global one. The map at the end is compared
+with the Voronoi graph of the full room, which is made from its walls, without a robot.
+
+Ten scans see most junctions once or twice, so that here a landmark counts from its first sighting
+(`confirm=1`); two junctions of the room are 0.25 m apart, so that `apart` is less than that.
+The ten places were chosen for what can be seen from them: JSON also says what other draws of the
+noise give, and what places do that are moved a little.
+"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from experiments.common import BLACK, BLUE, GREEN, RED, SKY, Numbers, parse, save
+from experiments.room_graph import reference
+from jaxslam import slam, topomap, world
+from jaxslam.geometry import between, to_world
+from jaxslam.grid import centres
+from jaxslam.lidar import cast, disturb
+from jaxslam.motion import Robot, process_noise, wheel_coefficients
+from jaxslam.types import NODE
+from jaxslam.voronoi import branches
+
+WORLD = "fig07"
+CONFIG = slam.Config(confirm=1, apart=0.15)
+NEAR = 0.1  # [m] a node of the map this close to a junction is that junction
+SHIFT = (0.05, 0.05, 0.05)  # [m, m, rad] standard deviation of places that are moved
+
+
+@jax.jit
+def scans_from(poses: jax.Array, walls: jax.Array, key: jax.Array):
+    """Noisy scans [T] of the walls (S, 4) from poses (T, 3)."""
+    look = lambda pose, own: disturb(
+        own, cast(world.World(walls), pose, CONFIG.lidar), CONFIG.lidar
+    )
+    return jax.vmap(look)(poses, jax.random.split(key, poses.shape[0]))
+
+
+def odometry(places: np.ndarray, robot: Robot, seed: int) -> np.ndarray:
+    """What the encoders say (T, 3) of the way between successive places (T, 3)."""
+    told, random = [np.zeros(3)], np.random.default_rng(seed)
+    for a, b in zip(jnp.asarray(places[:-1], float), jnp.asarray(places[1:], float), strict=True):
+        motion = between(a, b)
+        cov = np.asarray(process_noise(wheel_coefficients(robot), motion), np.float64)
+        told.append(random.multivariate_normal(np.asarray(motion), (cov + cov.T) / 2))
+    return np.array(told)
+
+
+step = jax.jit(slam.step, static_argnums=0)
+add = jax.jit(topomap.add)
+
+
+@jax.jit
+def branch_cells(scans):
+    """Cells [T] (H, W) bool of the branches of each local diagram."""
+
+    def one(scan):
+        _, diagram, sources = slam.look(CONFIG, scan)
+        return branches(diagram, sources)
+
+    return jax.lax.map(one, scans)
+
+
+def explore(
+    places: np.ndarray, walls: np.ndarray, seed: int
+) -> tuple[list[Numbers], np.ndarray, tuple]:
+    """Scan from each place, and add each local map to the global one at once.
+
+    Returns:
+        The global map after each scan, the estimated poses (T, 3), and the scans with their local
+        maps.
+    """
+    robot = Robot()
+    poses, noise = jnp.asarray(places, float), slam.wheel_noise(robot)
+    scans = scans_from(poses, jnp.asarray(walls, float), jax.random.key(seed))
+    told = jnp.asarray(odometry(places, robot, seed), float)
+    seen, links = slam.local_maps(CONFIG, scans)
+    belief, arcs = slam.init(CONFIG, poses[0]), topomap.empty(arcs=2 * CONFIG.landmarks)
+    maps, way = [], []
+    for t in range(len(places)):
+        nodes, branch = jax.tree.map(lambda x, t=t: x[t], (seen, links))
+        belief, info = step(CONFIG, noise, belief, slam.Inputs(told[t], nodes))
+        arcs = add(arcs, info.id, info.pose, branch)
+        way.append(np.asarray(info.pose))
+        maps.append(plain_map(topomap.graph(belief, arcs, np.array(way), confirm=CONFIG.confirm)))
+    return maps, np.array(way), (scans, seen, links)
+
+
+def plain_map(graph: topomap.Graph) -> Numbers:
+    """Nodes and arcs of a map, without its corners."""
+    nodes = np.flatnonzero(graph.kind == NODE)
+    rank = {int(n): k for k, n in enumerate(nodes)}
+    return {
+        "id": graph.id[nodes],
+        "xy": graph.xy[nodes].round(4),
+        "clearance_m": graph.clearance[nodes].round(3),
+        "arcs": [[rank[a], rank[b]] for a, b in graph.pairs.tolist()],
+        "via": graph.via.round(3),
+        "driven_only": np.isnan(graph.arc_clearance),
+    }
+
+
+def local_views(way: np.ndarray, scans, seen, links) -> list[Numbers]:
+    """What each scan adds, in the map's frame: branch cells, junctions and arcs between them."""
+    cells, views = np.asarray(branch_cells(scans)), []
+    middle = np.asarray(centres(CONFIG.grid))
+    for t, pose in enumerate(way):
+        place = lambda xy, pose=pose: np.asarray(to_world(jnp.asarray(pose), jnp.asarray(xy)))
+        keep = np.asarray(seen.valid[t] & (seen.kind[t] == NODE))
+        views.append(
+            {
+                "branches": place(middle[cells[t]]).round(2),
+                "nodes": place(seen.xy[t])[keep].round(3),
+                "arcs": int(np.sum(links.valid[t])),
+            }
+        )
+    return views
+
+
+# The comparison.
+
+
+def compare(found: Numbers, true: Numbers) -> Numbers:
+    """Nodes and arcs of a map against junctions and branches of the full room."""
+    junctions = np.array([j["xy"] for j in true["junctions"]])
+    xy = np.asarray(found["xy"]).reshape(-1, 2)
+    away = np.linalg.norm(xy[:, None] - junctions[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(away, 2 * NEAR))
+    match = {int(n): int(j) for n, j in zip(rows, columns, strict=True) if away[n, j] <= NEAR}
+    errors = [away[n, j] for n, j in match.items()]
+    named = [tuple(sorted(match.get(n, -1) for n in pair)) for pair in found["arcs"]]
+    wanted = {tuple(pair) for pair in true["arcs"]}
+    driven = {p for p, only in zip(named, found["driven_only"], strict=True) if only}
+    lines = {
+        tuple(pair): np.array(line) for pair, line in zip(true["arcs"], true["lines"], strict=True)
+    }
+    off = [
+        np.min(np.hypot(*(lines[name] - via).T))
+        for name, via in zip(named, np.asarray(found["via"]), strict=True)
+        if name in wanted - driven
+    ]
+    wrong = [pair for pair, name in zip(found["arcs"], named, strict=True) if name not in wanted]
+    return {
+        "junctions": len(junctions),
+        "nodes_found": len(match),
+        "nodes_missed": sorted(set(range(len(junctions))) - set(match.values())),
+        "nodes_spurious": sorted(set(range(len(xy))) - set(match)),
+        "position_error_m": middle_and_worst(errors),
+        "arcs": len(wanted),
+        "arcs_found": len(wanted & set(named)),
+        "arcs_found_by_driving_only": len(wanted & driven),
+        "arc_middle_off_branch_m": middle_and_worst(off),
+        "arcs_missed": sorted(wanted - set(named)),
+        "arcs_spurious": wrong,
+        "junction_of_node": [match.get(n, -1) for n in range(len(xy))],
+    }
+
+
+def middle_and_worst(errors: list[float]) -> Numbers:
+    """Median and largest of some errors [m], none of none."""
+    if not errors:
+        return {"median": None, "max": None}
+    return {"median": round(float(np.median(errors)), 4), "max": round(float(max(errors)), 4)}
+
+
+def repeat(places: np.ndarray, walls: np.ndarray, true: Numbers, seeds: range, shift) -> Numbers:
+    """Means of the comparison over other draws of the noise, the places moved by `shift` (3,)."""
+    results = []
+    for seed in seeds:
+        moved = places + np.random.default_rng(seed).normal(size=places.shape) * shift
+        results.append(compare(explore(moved, walls, seed)[0][-1], true))
+    count = lambda key: [len(r[key]) if isinstance(r[key], list) else r[key] for r in results]
+    keys = ["nodes_found", "nodes_spurious", "arcs_found", "arcs_spurious"]
+    worst = [r["position_error_m"]["max"] for r in results if r["nodes_found"]]
+    whole = [n == len(true["junctions"]) for n in count("nodes_found")]
+    return {
+        "runs": len(results),
+        **{f"{key}_mean": float(np.mean(count(key))) for key in keys},
+        "runs_with_all_nodes": int(np.sum(whole)),
+        "runs_equal": sum(equal(r) for r in results),
+        "position_error_max_m": max(worst, default=None),
+    }
+
+
+def equal(result: Numbers) -> bool:
+    """Whether a map has the nodes and arcs of the full room, and no others."""
+    keys = ("nodes_missed", "nodes_spurious", "arcs_missed", "arcs_spurious")
+    return not any(result[key] for key in keys)
+
+
+def compute(seed: int, runs: int) -> Numbers:
+    """The maps scan by scan, the reference, and how they compare."""
+    places, walls = world.places(WORLD), np.asarray(world.named(WORLD).walls)
+    true = reference(walls)
+    maps, way, local = explore(places, walls, seed)
+    result = compare(maps[-1], true)
+    others = range(seed + 1, seed + 1 + runs)
+    return {
+        "equals_the_voronoi_graph_of_the_room": equal(result),
+        "comparison": result,
+        "other_noise": repeat(places, walls, true, others, np.zeros(3)),
+        "places_moved": {"std_m_m_rad": SHIFT}
+        | repeat(places, walls, true, others, np.array(SHIFT)),
+        "nodes_in_map": [len(m["xy"]) for m in maps],
+        "arcs_in_map": [len(m["arcs"]) for m in maps],
+        "pose_error_m": np.hypot(*(way - places)[:, :2].T).round(4),
+        "places": places,
+        "estimates": way.round(4),
+        "walls": walls,
+        "reference": true,
+        "maps": maps,
+        "local": local_views(way, *local),
+    }
+
+
+# The picture.
+
+
+def draw_walls(axis, numbers: Numbers) -> None:
+    """Draw the walls and set the axis."""
+    for x1, y1, x2, y2 in numbers["walls"]:
+        axis.plot([x1, x2], [y1, y2], color="#8C8C8C", linewidth=1.3)
+    axis.set(xlim=(-0.15, 6.15), ylim=(-0.15, 5.15), aspect="equal")
+
+
+def draw_robot(axis, pose: list[float], size: float) -> None:
+    """Draw the robot as an arrow of length `size` [m] in the direction it looks."""
+    x, y, heading = pose
+    ahead = size * np.cos(heading), size * np.sin(heading)
+    style = {
+        "color": RED,
+        "width": 0.12 * size,
+        "head_width": 0.55 * size,
+        "head_length": 0.45 * size,
+        "length_includes_head": True,
+    }
+    axis.arrow(x, y, *ahead, zorder=4, linewidth=0, **style)
+
+
+def draw_map(axis, found: Numbers, width: float, size: float) -> None:
+    """Draw nodes and arcs of a map, each arc over the point half-way."""
+    for (a, b), via, driven in zip(found["arcs"], found["via"], found["driven_only"], strict=True):
+        line = np.array([found["xy"][a], via, found["xy"][b]])
+        label = "arc of the map, driven only" if driven else "arc of the map"
+        dashes = (0, (3, 1.5)) if driven else "-"
+        axis.plot(*line.T, color=GREEN, linewidth=width, linestyle=dashes, label=label, zorder=2)
+    if found["xy"]:
+        style = {"markersize": size, "markeredgecolor": "white", "markeredgewidth": 0.5}
+        nodes = np.array(found["xy"]).T
+        axis.plot(*nodes, "o", color=GREEN, label="node of the map", zorder=3, **style)
+
+
+def draw_step(axis, numbers: Numbers, t: int) -> None:
+    """Draw the local diagram of scan `t` over the map it has been added to."""
+    view, found = numbers["local"][t], numbers["maps"][t]
+    draw_walls(axis, numbers)
+    if view["branches"]:
+        axis.plot(*np.array(view["branches"]).T, "s", color=SKY, markersize=1.1, zorder=1)
+    draw_map(axis, found, 1.4, 5)
+    if view["nodes"]:
+        nodes = np.array(view["nodes"]).T
+        axis.plot(*nodes, "o", markersize=8, markerfacecolor="none", color=BLACK, zorder=3)
+    draw_robot(axis, numbers["estimates"][t], 0.6)
+    counts = f"{numbers['nodes_in_map'][t]} nodes, {numbers['arcs_in_map'][t]} arcs"
+    axis.set_title(f"scan {t + 1}: {counts}", fontsize=9)
+    axis.tick_params(labelsize=7)
+
+
+def draw_whole(axis, numbers: Numbers) -> None:
+    """Draw the map at the end over the Voronoi graph of the full room."""
+    draw_walls(axis, numbers)
+    for line in numbers["reference"]["lines"]:
+        axis.plot(
+            *np.array(line).T, color=SKY, linewidth=5, alpha=0.6, label="branch of the full room"
+        )
+    for junction in numbers["reference"]["junctions"]:
+        ring = np.linspace(0, 2 * np.pi, 40)
+        rim = np.array(junction["xy"])[:, None] + NEAR * np.array([np.cos(ring), np.sin(ring)])
+        axis.plot(
+            *rim, color=BLACK, linewidth=1.1, label="10 cm around a junction of the full room"
+        )
+    draw_map(axis, numbers["maps"][-1], 1.8, 6)
+    way = np.array(numbers["places"])[:, :2].T
+    axis.plot(*way, color=BLUE, linewidth=0.7, linestyle=":", label="way between the places")
+    for t, pose in enumerate(numbers["estimates"]):
+        draw_robot(axis, pose, 0.28)
+        axis.annotate(f"{t + 1}", pose[:2], (-9, -9), textcoords="offset points", fontsize=8)
+    result = numbers["comparison"]
+    axis.set_title(
+        f"{result['nodes_found']} of {result['junctions']} junctions, "
+        f"{result['arcs_found']} of {result['arcs']} arcs; spurious: "
+        f"{len(result['nodes_spurious'])} nodes, {len(result['arcs_spurious'])} arcs"
+    )
+    axis.set(xlabel="x [m]", ylabel="y [m]")
+
+
+def draw(numbers: Numbers, path: Path) -> None:
+    """Draw the ten steps, and below them the map at the end."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 12.5), dpi=100, layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[1, 1.45])
+    steps = upper.subplots(2, 5, sharex=True, sharey=True)
+    for t, axis in enumerate(steps.flat):
+        draw_step(axis, numbers, t)
+    for axis in steps[-1]:
+        axis.set_xlabel("x [m]")
+    for axis in steps[:, 0]:
+        axis.set_ylabel("y [m]")
+    whole = lower.subplots()
+    draw_whole(whole, numbers)
+    handles, names = whole.get_legend_handles_labels()
+    unique = dict(zip(names, handles, strict=True))
+    lower.legend(unique.values(), unique.keys(), loc="outside right center", frameon=False)
+    upper.suptitle(
+        "light blue: branches of the local diagram; rings: its junctions; green: the map so far; "
+        "arrow: where the robot looks",
+        fontsize=10,
+    )
+    figure.savefig(path)
+
+
+def main() -> None:
+    """Run the experiment."""
+    given = parse(__doc__, runs=12)
+    numbers = compute(given.seed, given.runs)
+    save(given.out, "fig09_global", numbers, draw)
+
+
+if __name__ == "__main__":
+    main()

@@ -15,7 +15,7 @@ import tyro
 from tqdm import tqdm
 
 import jaxslam
-from jaxslam import lidar, monte_carlo, plan, report, slam
+from jaxslam import lidar, metrics, monte_carlo, plan, report, slam
 from jaxslam import world as worlds
 from jaxslam.io import carmen, tum
 from jaxslam.io import noise as noise_file
@@ -134,12 +134,12 @@ def run(
     verified = None if relations is None else relations_file.read(relations)
     assumed = _noise(noise, slam.log_noise())
     config = Config(lidar=recording.lidar, landmarks=LANDMARKS, confirm=CONFIRM)
-    wheels = report.seen_from(recording.odometry[0], recording.odometry)
+    wheels = metrics.seen_from(recording.odometry[0], recording.odometry)
     with _named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)
     with _named(f"{relations or ''}"):
         blind |= {} if verified is None else report.against_relations(recording, wheels, verified)
-    motions = np.concatenate([np.zeros((1, 3)), report.seen_from(wheels[:-1], wheels[1:])])
+    motions = np.concatenate([np.zeros((1, 3)), metrics.seen_from(wheels[:-1], wheels[1:])])
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
     with folder(out) as place:
         _keep_compiled()

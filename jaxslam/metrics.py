@@ -210,7 +210,7 @@ def relations_error(
     start, end = (
         _pose_at(t[used], slack, times, poses, wheel_times, wheel_poses) for t in (t1, t2)
     )
-    error = _between(motion[used], _between(start, end))
+    error = seen_from(motion[used], seen_from(start, end))
     distance = np.hypot(error[:, 0], error[:, 1])
     turn = np.degrees(np.abs(error[:, 2]))
     return {
@@ -234,7 +234,7 @@ def _pose_at(
     times, poses = _by_time(times, poses)
     last = np.searchsorted(times, wanted + slack, side="right") - 1
     wheels = _by_time(wheel_times, wheel_poses)
-    moved = _between(_interpolate(times[last], *wheels), _interpolate(wanted, *wheels))
+    moved = seen_from(_interpolate(times[last], *wheels), _interpolate(wanted, *wheels))
     return _compose(poses[last], moved)
 
 
@@ -258,10 +258,13 @@ def _compose(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
     return np.stack([x, y, _wrap(pose[..., 2] + motion[..., 2])], axis=-1)
 
 
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """As `geometry.between`, for (..., 3) in float64 whatever JAX's precision."""
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    d = b - a
+def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) in the frames of others (..., 3).
+
+    As `geometry.between`, in float64 whatever JAX's precision.
+    """
+    c, s = np.cos(frames[..., 2]), np.sin(frames[..., 2])
+    d = poses - frames
     x, y = c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]
     return np.stack([x, y, _wrap(d[..., 2])], axis=-1)
 

@@ -39,14 +39,6 @@ def error_of(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.asarray(metrics.pose_error(jnp.asarray(poses, float), jnp.asarray(truth, float)))
 
 
-def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (..., 3) in the frames of others (..., 3): `geometry.between` in float64."""
-    c, s = np.cos(frames[..., 2]), np.sin(frames[..., 2])
-    x, y, turn = np.moveaxis(poses - frames, -1, 0)
-    turn = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
-    return np.stack([c * x + s * y, c * y - s * x, turn], axis=-1)
-
-
 def length(poses: np.ndarray) -> float:
     """Length [m] of the way along poses (T, 3)."""
     return float(np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
@@ -68,7 +60,7 @@ def against_reference(times: np.ndarray, poses: np.ndarray, known: Trajectory) -
     numbers = metrics.ate(times, poses, *known)
     i, j = metrics.match_times(times, known[0]).T
     frame = metrics.align(poses[i, :2], known[1][j, :2])
-    turn = seen_from(seen_from(frame, known[1][j]), poses[i])[:, 2]
+    turn = metrics.seen_from(metrics.seen_from(frame, known[1][j]), poses[i])[:, 2]
     numbers["heading_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(turn**2))))
     return numbers
 
@@ -91,10 +83,12 @@ def beside(
     i, j = metrics.match_times(times, known[0]).T
     frame = metrics.align(poses[i, :2], known[1][j, :2])
     zero = np.zeros(3)
-    first = seen_from(seen_from(known[1][j[0]], zero), seen_from(poses[i[0]], zero))
+    first = metrics.seen_from(
+        metrics.seen_from(known[1][j[0]], zero), metrics.seen_from(poses[i[0]], zero)
+    )
     error = np.full(poses.shape, np.nan)
-    error[i] = error_of(poses[i], seen_from(first, known[1][j]))
-    return seen_from(frame, known[1][j]), error
+    error[i] = error_of(poses[i], metrics.seen_from(first, known[1][j]))
+    return metrics.seen_from(frame, known[1][j]), error
 
 
 def write(place: Path, numbers: Numbers, times: np.ndarray, survey: Survey) -> None:

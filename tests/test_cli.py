@@ -13,7 +13,7 @@ from evo.core import sync
 from evo.tools import file_interface
 
 import jaxslam
-from jaxslam import cli, geometry, lidar, report, world
+from jaxslam import cli, geometry, lidar, metrics, world
 from jaxslam.io import carmen, tum
 
 # The commands run in processes of their own, in float32 as users run them; a short drive and
@@ -75,7 +75,7 @@ def done(tmp_path_factory):
     stamps, (poses, _) = np.arange(SCANS) + 0.5, drive()
     tum.write(place / "reference.tum", stamps, poses)
     steps = zip(stamps[:-1], stamps[1:], drive()[0][:-1], drive()[0][1:], strict=True)
-    lines = ["{} {} {} {} 0 0 0 {}".format(a, b, *report.seen_from(p, q)) for a, b, p, q in steps]
+    lines = ["{} {} {} {} 0 0 0 {}".format(a, b, *metrics.seen_from(p, q)) for a, b, p, q in steps]
     (place / "pairs.relations").write_text("\n".join(lines) + "\n")
     options = ["--reference", place / "reference.tum", "--relations", place / "pairs.relations"]
     simulated = begin(
@@ -297,5 +297,5 @@ def test_the_package_exports_what_it_says_and_not_much():
 
 def test_poses_seen_from_others_agree_with_geometry():
     a, b = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, -2.0]]), np.array([[0.0, 5.0, -3.0], [1.0, 1, 1]])
-    expected = jax.vmap(geometry.compose)(a, jnp.asarray(report.seen_from(a, b)))
+    expected = jax.vmap(geometry.compose)(a, jnp.asarray(metrics.seen_from(a, b)))
     np.testing.assert_allclose(expected, b, atol=1e-12)

@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import association, edges, ekf, nodes, topomap, voronoi
+from jaxslam import association, edges, ekf, junctions, links, nodes, topomap, voronoi
 from jaxslam.edges import RunSpec
 from jaxslam.ekf import Belief
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
+from jaxslam.links import Links
 from jaxslam.motion import Robot, process_noise, wheel_coefficients
-from jaxslam.nodes import Links, Nodes, NodeSpec
+from jaxslam.nodes import Nodes, NodeSpec
 from jaxslam.types import CORNER, NODE, WALL, Array
 
 BATCH = 16  # scans that are looked at together
@@ -119,7 +120,7 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
     diagram = voronoi.expand(labels, open, steps=config.steps)
     cells = voronoi.junctions(diagram, sources)
     found = nodes.join(
-        nodes.find_junctions(cells, scan, runs, lidar, spec, config.nodes),
+        junctions.find_junctions(cells, scan, runs, lidar, spec, config.nodes),
         nodes.find_corners(runs, config.nodes),
         nodes.find_walls(runs, config.nodes),
     )
@@ -129,8 +130,10 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
 def local_map(config: Config, scan: Scan) -> tuple[Nodes, Links]:
     """Local topological map of one scan: its landmarks and the arcs between its junctions."""
     found, diagram, sources = look(config, scan)
-    links = nodes.find_links(found, diagram, sources, scan, config.lidar, config.grid, config.nodes)
-    return found, links
+    joined = links.find_links(
+        found, diagram, sources, scan, config.lidar, config.grid, config.nodes
+    )
+    return found, joined
 
 
 def init(config: Config, pose: Array) -> Belief:
@@ -253,8 +256,8 @@ def local_maps(config: Config, scans: Scan) -> tuple[Nodes, Links]:
 
 
 @partial(jax.jit, static_argnames="arcs")
-def _arcs(info: Info, links: Links, *, arcs: int) -> topomap.Arcs:
-    return topomap.build(info.id, info.pose, links, arcs=arcs)
+def _arcs(info: Info, joined: Links, *, arcs: int) -> topomap.Arcs:
+    return topomap.build(info.id, info.pose, joined, arcs=arcs)
 
 
 def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Scan) -> Survey:
@@ -267,9 +270,9 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
         motions: (T, 3) odometry since the scan before, zero at the first.
         scans: [T].
     """
-    seen, links = local_maps(config, scans)
+    seen, joined = local_maps(config, scans)
     belief, info = run(config, noise, init(config, start), Inputs(motions, seen))
-    arcs = _arcs(info, links, arcs=2 * config.landmarks)
+    arcs = _arcs(info, joined, arcs=2 * config.landmarks)
     graph = topomap.graph(belief, arcs, np.asarray(info.pose), confirm=config.confirm)
     return Survey(belief, info, seen, graph)
 

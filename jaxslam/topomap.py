@@ -13,7 +13,7 @@ from jax import lax
 from jaxslam.association import claim_slots
 from jaxslam.ekf import Belief
 from jaxslam.geometry import to_world
-from jaxslam.nodes import Links
+from jaxslam.links import Links
 from jaxslam.types import CORNER, NODE, Array
 
 

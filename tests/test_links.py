@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import reference
 
-from jaxslam import lidar, nodes, slam, voronoi, world
+from jaxslam import lidar, links, slam, voronoi, world
 from jaxslam.geometry import to_world
 from jaxslam.grid import cell_of, centres
 from jaxslam.plan import densify
@@ -34,7 +34,7 @@ def look(walls, pose):
 
 @jax.jit
 def find(found, diagram, sources, scan):
-    return nodes.find_links(found, diagram, sources, scan, CONFIG.lidar, GRID, CONFIG.nodes)
+    return links.find_links(found, diagram, sources, scan, CONFIG.lidar, GRID, CONFIG.nodes)
 
 
 def scene(walls, pose):
@@ -67,7 +67,7 @@ def walk(found, diagram, sources):
         for cell in map(tuple, np.argwhere(away < AT)):
             owners.setdefault(cell, set()).add(int(k))
     front = list(owners)
-    for _ in range(nodes.LINK_STEPS):
+    for _ in range(links.LINK_STEPS):
         reached = {}
         for cell in front:
             for beside in reference.neighbours(cell, branch.shape):

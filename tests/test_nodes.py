@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import edges, lidar, nodes, slam, world
+from jaxslam import edges, junctions, lidar, nodes, slam, world
 from jaxslam.geometry import compose, to_robot, to_world, wrap_angle, wrap_line
 from jaxslam.slam import Config
 from jaxslam.types import CORNER, NODE, WALL
@@ -38,7 +38,7 @@ def features(walls, pose):
 
 @jax.jit
 def circle(scan, place):
-    return nodes.tangent_circle(place, edges.runs(scan, LIDAR, CONFIG.runs), SPEC)
+    return junctions.tangent_circle(place, edges.runs(scan, LIDAR, CONFIG.runs), SPEC)
 
 
 def test_the_incircle_of_a_triangle_is_exact_from_any_start():
@@ -153,7 +153,7 @@ def test_covariance_of_a_node_is_that_of_its_lines():
     @jax.jit
     def centres(scan, draws):
         runs = edges.runs(scan, LIDAR, CONFIG.runs)
-        fit = lambda draw: nodes.tangent_circle(start, shifted(runs, draw), SPEC).centre
+        fit = lambda draw: junctions.tangent_circle(start, shifted(runs, draw), SPEC).centre
         return jax.lax.map(fit, draws)
 
     draws = jax.random.normal(jax.random.key(1), (samples, 2, CONFIG.runs.capacity))

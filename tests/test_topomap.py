@@ -5,7 +5,7 @@ import pytest
 
 from jaxslam import ekf, topomap
 from jaxslam.geometry import to_world
-from jaxslam.nodes import Links
+from jaxslam.links import Links
 from jaxslam.types import CORNER, NODE, WALL
 
 HERE = jnp.zeros(3)

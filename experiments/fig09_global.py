@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from experiments.common import BLACK, BLUE, GREEN, RED, SKY, Numbers, parse, save
+from experiments.common import BLACK, BLUE, GREEN, PINK, RED, SKY, Numbers, parse, save
 from experiments.room_graph import reference
-from jaxslam import slam, topomap, world
+from jaxslam import slam, topomap, ways, world
 from jaxslam.geometry import between, to_world
 from jaxslam.grid import centres
 from jaxslam.lidar import cast, disturb
@@ -53,7 +53,7 @@ def odometry(places: np.ndarray, robot: Robot, seed: int) -> np.ndarray:
 
 
 step = jax.jit(slam.step, static_argnums=0)
-add = jax.jit(topomap.add)
+add = jax.jit(topomap.add, static_argnames="lidar")
 
 
 @jax.jit
@@ -84,11 +84,14 @@ def explore(
     belief, arcs = slam.init(CONFIG, poses[0]), topomap.empty(arcs=2 * CONFIG.landmarks)
     maps, way = [], []
     for t in range(len(places)):
-        nodes, branch = jax.tree.map(lambda x, t=t: x[t], (seen, links))
+        nodes, branch, scan = jax.tree.map(lambda x, t=t: x[t], (seen, links, scans))
         belief, info = step(CONFIG, noise, belief, slam.Inputs(told[t], nodes))
-        arcs = add(arcs, info.id, info.pose, branch)
+        arcs = add(arcs, info.id, info.pose, branch, scan, lidar=CONFIG.lidar)
         way.append(np.asarray(info.pose))
-        maps.append(plain_map(topomap.graph(belief, arcs, np.array(way), confirm=CONFIG.confirm)))
+        graph = topomap.graph(
+            belief, arcs, np.array(way), confirm=CONFIG.confirm, apart=CONFIG.apart
+        )
+        maps.append(plain_map(graph))
     return maps, np.array(way), (scans, seen, links)
 
 
@@ -101,8 +104,11 @@ def plain_map(graph: topomap.Graph) -> Numbers:
         "xy": graph.xy[nodes].round(4),
         "clearance_m": graph.clearance[nodes].round(3),
         "arcs": [[rank[a], rank[b]] for a, b in graph.pairs.tolist()],
-        "via": graph.via.round(3),
+        "lines": [line.round(3) for line in graph.lines],
         "driven_only": np.isnan(graph.arc_clearance),
+        "length_m": graph.length.round(3),
+        "arc_clearance_m": graph.arc_clearance.round(3),
+        "frontiers": [line.round(3) for line in graph.frontiers],
     }
 
 
@@ -117,7 +123,7 @@ def local_views(way: np.ndarray, scans, seen, links) -> list[Numbers]:
             {
                 "branches": place(middle[cells[t]]).round(2),
                 "nodes": place(seen.xy[t])[keep].round(3),
-                "arcs": int(np.sum(links.valid[t])),
+                "arcs": int(np.sum(links.valid[t] & (links.pair[t, :, 1] >= 0))),
             }
         )
     return views
@@ -136,28 +142,34 @@ def compare(found: Numbers, true: Numbers) -> Numbers:
     errors = [away[n, j] for n, j in match.items()]
     named = [tuple(sorted(match.get(n, -1) for n in pair)) for pair in found["arcs"]]
     wanted = {tuple(pair) for pair in true["arcs"]}
-    driven = {p for p, only in zip(named, found["driven_only"], strict=True) if only}
-    lines = {
-        tuple(pair): np.array(line) for pair, line in zip(true["arcs"], true["lines"], strict=True)
-    }
+    seen = {p for p, only in zip(named, found["driven_only"], strict=True) if not only}
+    lines = dict(zip(map(tuple, true["arcs"]), map(np.array, true["lines"]), strict=True))
     off = [
-        np.min(np.hypot(*(lines[name] - via).T))
-        for name, via in zip(named, np.asarray(found["via"]), strict=True)
-        if name in wanted - driven
+        np.max(ways.beside(np.array(line), lines[name])[0])
+        for name, line in zip(named, found["lines"], strict=True)
+        if name in wanted & seen
     ]
-    wrong = [pair for pair, name in zip(found["arcs"], named, strict=True) if name not in wanted]
+    # Two arcs where the room has one: the second is as wrong as one where it has none.
+    wrong = [
+        pair
+        for k, (pair, name) in enumerate(zip(found["arcs"], named, strict=True))
+        if name not in wanted or name in named[:k]
+    ]
     return {
         "junctions": len(junctions),
         "nodes_found": len(match),
         "nodes_missed": sorted(set(range(len(junctions))) - set(match.values())),
         "nodes_spurious": sorted(set(range(len(xy))) - set(match)),
         "position_error_m": middle_and_worst(errors),
+        "worst_node_error_m": round(float(max(errors, default=np.inf)), 4),
         "arcs": len(wanted),
         "arcs_found": len(wanted & set(named)),
-        "arcs_found_by_driving_only": len(wanted & driven),
-        "arc_middle_off_branch_m": middle_and_worst(off),
+        "arcs_found_by_driving_only": len((wanted & set(named)) - seen),
+        "arc_off_branch_m": middle_and_worst(off),
         "arcs_missed": sorted(wanted - set(named)),
         "arcs_spurious": wrong,
+        "missing_arcs": len(wanted - set(named)),
+        "extra_arcs": len(wrong),
         "junction_of_node": [match.get(n, -1) for n in range(len(xy))],
     }
 
@@ -203,6 +215,7 @@ def compute(seed: int, runs: int) -> Numbers:
     others = range(seed + 1, seed + 1 + runs)
     return {
         "equals_the_voronoi_graph_of_the_room": equal(result),
+        **{key: result[key] for key in ("worst_node_error_m", "extra_arcs", "missing_arcs")},
         "comparison": result,
         "other_noise": repeat(places, walls, true, others, np.zeros(3)),
         "places_moved": {"std_m_m_rad": SHIFT}
@@ -233,23 +246,23 @@ def draw_robot(axis, pose: list[float], size: float) -> None:
     """Draw the robot as an arrow of length `size` [m] in the direction it looks."""
     x, y, heading = pose
     ahead = size * np.cos(heading), size * np.sin(heading)
-    style = {
-        "color": RED,
-        "width": 0.12 * size,
-        "head_width": 0.55 * size,
-        "head_length": 0.45 * size,
-        "length_includes_head": True,
-    }
+    style = {"color": RED, "width": 0.12 * size, "head_width": 0.55 * size}
+    style |= {"head_length": 0.45 * size, "length_includes_head": True}
     axis.arrow(x, y, *ahead, zorder=4, linewidth=0, **style)
 
 
 def draw_map(axis, found: Numbers, width: float, size: float) -> None:
-    """Draw nodes and arcs of a map, each arc over the point half-way."""
-    for (a, b), via, driven in zip(found["arcs"], found["via"], found["driven_only"], strict=True):
-        line = np.array([found["xy"][a], via, found["xy"][b]])
+    """Draw nodes and arcs of a map."""
+    for line, driven in zip(found["lines"], found["driven_only"], strict=True):
         label = "arc of the map, driven only" if driven else "arc of the map"
         dashes = (0, (3, 1.5)) if driven else "-"
-        axis.plot(*line.T, color=GREEN, linewidth=width, linestyle=dashes, label=label, zorder=2)
+        axis.plot(
+            *np.array(line).T, color=GREEN, linewidth=width, linestyle=dashes, label=label, zorder=2
+        )
+    for line in found["frontiers"]:
+        label = "way into what was not seen"
+        axis.plot(*np.array(line).T, color=PINK, linewidth=width / 2, label=label, zorder=1.5)
+        axis.plot(*line[-1], "x", color=PINK, markersize=size, zorder=3)
     if found["xy"]:
         style = {"markersize": size, "markeredgecolor": "white", "markeredgewidth": 0.5}
         nodes = np.array(found["xy"]).T
@@ -309,10 +322,9 @@ def draw(numbers: Numbers, path: Path) -> None:
     steps = upper.subplots(2, 5, sharex=True, sharey=True)
     for t, axis in enumerate(steps.flat):
         draw_step(axis, numbers, t)
-    for axis in steps[-1]:
-        axis.set_xlabel("x [m]")
-    for axis in steps[:, 0]:
-        axis.set_ylabel("y [m]")
+    for axis in steps.flat:
+        axis.set(xlabel="x [m]", ylabel="y [m]")
+        axis.label_outer()
     whole = lower.subplots()
     draw_whole(whole, numbers)
     handles, names = whole.get_legend_handles_labels()

@@ -34,11 +34,11 @@ def padded(path: np.ndarray) -> tuple[jnp.ndarray, jnp.ndarray]:
 
 
 @partial(jax.jit, static_argnames="robot")
-def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief):
+def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief, arcs):
     """Follow `path` by the belief, from a true pose (3,); all scans are of where the robot is."""
 
     def step(now, key):
-        truth, belief, at = now
+        truth, belief, arcs, at = now
         roll_key, scan_key = jax.random.split(key)
         told, at = plan.follow(path, at, belief.pose)
         draws = jax.random.normal(roll_key, (monte_carlo.SUBSTEPS, 2), path.dtype)
@@ -46,13 +46,14 @@ def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief)
         scan = lidar.disturb(scan_key, lidar.cast(place, truth, CONFIG.lidar), CONFIG.lidar)
         seen, links = slam.local_map(CONFIG, scan)
         belief, info = slam.step(CONFIG, noise, belief, slam.Inputs(told, seen))
-        return (truth, belief, at), (truth, told, info, links)
+        arcs = topomap.add(arcs, info.id, info.pose, links, scan, CONFIG.lidar)
+        return (truth, belief, arcs, at), (truth, told, info)
 
-    start = (truth, belief, begin)
-    (truth, belief, _), (truths, told, info, links) = jax.lax.scan(
+    start = (truth, belief, arcs, begin)
+    (truth, belief, arcs, _), (truths, told, info) = jax.lax.scan(
         step, start, jax.random.split(key, STEPS)
     )
-    return truth, belief, truths, told, info, links
+    return truth, belief, arcs, truths, told, info
 
 
 def way_home(graph: topomap.Graph, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -62,13 +63,8 @@ def way_home(graph: topomap.Graph, start: np.ndarray, goal: np.ndarray) -> np.nd
     part = connected_components(joined, directed=False)[1]
     nodes = np.flatnonzero(part == np.argmax(np.bincount(part)))
     nearest = lambda place: nodes[np.argmin(np.linalg.norm(graph.xy[nodes] - place, axis=1))]
-    route = plan.route(graph.xy, graph.pairs, graph.length, nearest(start), nearest(goal))
-    points = [start]
-    for a, b in zip(route[:-1], route[1:], strict=True):
-        arcs = [k for k, pair in enumerate(graph.pairs.tolist()) if set(pair) == {a, b}]
-        arc = min(arcs, key=lambda k: graph.length[k])
-        points += [graph.xy[a], graph.via[arc]]
-    return np.array([*points, graph.xy[route[-1]], goal])
+    way = plan.route(graph, nearest(start), nearest(goal))
+    return np.array([start, *way.line, goal])
 
 
 def clearance(walls: np.ndarray, places: np.ndarray) -> float:
@@ -90,16 +86,15 @@ def compute(seed: int) -> common.Numbers:
     arcs = topomap.empty(arcs=2 * CONFIG.landmarks)
     path, blind = np.asarray(tour), first
     for name, key in (("out", out_key), ("home", home_key)):
-        truth, belief, truths, told, info, links = leg(
-            key, robot, place, noise, *padded(path), truth, belief
+        truth, belief, arcs, truths, told, info = leg(
+            key, robot, place, noise, *padded(path), truth, belief, arcs
         )
         still = np.all(np.asarray(told) == 0.0, axis=1)
         moved = int(np.argmax(still)) if still.any() else STEPS  # it stops at the end of its path
         cut = lambda tree: jax.tree.map(lambda x: x[:moved], tree)  # noqa: B023
-        truths, told, info, links = cut((truths, told, info, links))
+        truths, told, info = cut((truths, told, info))
         odometry = monte_carlo.dead_reckoning(blind, told)
         error = np.asarray(pose_error(info.pose, truths))
-        arcs = merge(arcs, info, links)
         legs.append(
             {
                 "leg": name,
@@ -125,24 +120,20 @@ def compute(seed: int) -> common.Numbers:
     return {"seed": seed, "legs": legs, "map": graph._asdict(), "walls": walls}
 
 
-@jax.jit
-def merge(arcs: topomap.Arcs, info: slam.Info, links) -> topomap.Arcs:
-    """Add the links of a leg to the map."""
-    body = lambda arcs, now: (topomap.add(arcs, *now), None)
-    return jax.lax.scan(body, arcs, (info.id, info.pose, links))[0]
-
-
 def draw(numbers: common.Numbers, path: Path) -> None:
     """The world, both legs, and the map."""
     figure, axes = common.canvas(9, 7.2, 1, 1)
     axis = axes[0, 0]
     for x1, y1, x2, y2 in numbers["walls"]:
         axis.plot([x1, x2], [y1, y2], color=common.BLACK, linewidth=1)
-    graph = {key: np.array(value) for key, value in numbers["map"].items()}
-    for k, ((i, j), via) in enumerate(zip(graph["pairs"], graph["via"], strict=True)):
-        line = np.array([graph["xy"][i], via, graph["xy"][j]])
+    graph = {key: np.array(numbers["map"][key]) for key in ("xy", "kind")}
+    for k, line in enumerate(numbers["map"]["lines"]):
         label = "arcs of the map" if k == 0 else None
-        axis.plot(*line.T, color=common.SKY, linewidth=1.2, label=label)
+        axis.plot(*np.array(line).T, color=common.SKY, linewidth=1.2, label=label)
+    for k, line in enumerate(numbers["map"]["frontiers"]):
+        label = "ways into what was not seen" if k == 0 else None
+        style = {"color": common.PINK, "linewidth": 0.8, "marker": "x", "markevery": [-1]}
+        axis.plot(*np.array(line).T, label=label, **style)
     for one, colour in zip(numbers["legs"], (common.RED, common.BLUE), strict=True):
         estimate, truth = np.array(one["estimate"]), np.array(one["truth"])
         label = f"estimate, {one['leg']}"

@@ -136,6 +136,3 @@ def trace(vertex: int, came: dict[int, int | None]) -> list[int]:
         way.append(vertex)
         vertex = came[vertex]
     return way[::-1]
-
-
-# The robot.

@@ -1,4 +1,4 @@
-"""The command line: `jaxslam simulate` and `jaxslam run LOG`."""
+"""The command line: `jaxslam simulate`, `jaxslam run LOG` and `jaxslam map MAP.yaml`."""
 
 import os
 import sys
@@ -15,13 +15,13 @@ import tyro
 from tqdm import tqdm
 
 import jaxslam
-from jaxslam import lidar, metrics, monte_carlo, plan, report, slam
+from jaxslam import lidar, metrics, monte_carlo, plan, report, skeleton, slam
 from jaxslam import world as worlds
-from jaxslam.io import carmen, tum
+from jaxslam.io import carmen, graphml, occupancy, tum
 from jaxslam.io import noise as noise_file
 from jaxslam.io import relations as relations_file
 from jaxslam.io.errors import InputError
-from jaxslam.io.output import folder
+from jaxslam.io.output import folder, write_json
 from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
 from jaxslam.slam import Config, Noise
@@ -29,6 +29,7 @@ from jaxslam.types import NODE
 from jaxslam.world import World
 
 LANDMARKS = 256  # room for those of a recorded log
+AREA = 1.0  # [m^2] of the smallest region of a map that is drawn
 CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 `jaxslam COMMAND --help` lists the options of a command, `jaxslam --version` prints the version."""
@@ -40,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
     if argv[0] == "--version":
         print(f"jaxslam {jaxslam.__version__}")
         return 0
-    commands = {"simulate": simulate, "run": run}
+    commands = {"simulate": simulate, "run": run, "map": map_grid}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
     except InputError as error:
@@ -168,7 +169,58 @@ def run(
     report.tell(numbers, f"{len(poses)} scans of {log}", out)
 
 
-def _within(option: str, value: int, low: int, high: int) -> None:
+def map_grid(
+    map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP.yaml")],
+    clearance: float = 0.25,
+    speck: float = 0.1,
+    regions: Literal["largest", "all"] = "largest",
+    out: Path = Path("out"),
+) -> None:
+    """Turn a ROS occupancy map into a topological map.
+
+    Writes metrics.json, map.geojson, map.graphml and map.png; needs the extras [ros] and [graph].
+
+    Args:
+        map: YAML file of map_server, its image beside it.
+        clearance: Radius of the robot [m]: it must fit everywhere on the map.
+        speck: Things in free space no wider than this [m] are noise.
+        regions: Where the robot can be: the largest region, or all in which its centre has 1 m^2.
+        out: Folder for the results.
+    """
+    _within("--clearance", clearance, 0.01, 100.0)
+    _within("--speck", speck, 0.0, 100.0)
+    graphml.require()
+    grid = occupancy.read(map)
+    size = "{} x {} cells of {:g} m".format(*grid.free.shape, grid.resolution)
+    print(f"{map}: {size}", flush=True)
+    area = AREA if regions == "all" else None
+    stages = (*skeleton.STAGES, "writing")
+    with (
+        folder(out) as place,
+        tqdm(total=len(stages), unit="stage", delay=0.5, mininterval=0) as bar,
+    ):
+
+        def watch(stage: str) -> None:
+            bar.set_description(stage, refresh=False)
+            bar.update(stages.index(stage) - bar.n)
+
+        begin = perf_counter()
+        with _named(str(map)):
+            survey = skeleton.survey(
+                **grid._asdict(), clearance=clearance, speck=speck, area=area, watch=watch
+            )
+        seconds = {"run": perf_counter() - begin}
+        watch("writing")
+        numbers = report.of_map(survey) | {"clearance_m": clearance, "seconds": seconds}
+        write_json(place / "metrics.json", numbers)
+        report.write_map(place / "map.geojson", survey.graph)
+        graphml.write(place / "map.graphml", survey.graph)
+        report.draw_map(place / "map.png", grid, survey.graph)
+        bar.update()
+    report.tell_map(numbers, f"{map}: clearance {clearance:g} m, regions {survey.regions}", out)
+
+
+def _within(option: str, value: float, low: float, high: float) -> None:
     """Raise unless the value of an option is in its range."""
     if not low <= value <= high:
         raise InputError(f"{value} is not between {low} and {high}", field=option)

@@ -1,27 +1,107 @@
-"""The local topological map of one scan: which of its junctions the branches join."""
+"""The local topological map of one scan: which of its junctions the branches join, and how.
+
+The ids of the junctions expand along the branches, by the same automaton as the fronts before.
+Where two ids meet, there is a link; where an id comes to the end of what was seen, a frontier.
+The arrival steps lead back from there to the junctions, and so give the link its line.
+"""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from jaxslam.grid import GridSpec, centre_of, centres
+from jaxslam.grid import GridSpec, centre_of, centres, seen_free
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.nodes import Nodes, NodeSpec
 from jaxslam.types import Array
 from jaxslam.voronoi import Diagram, around, block_union, branches, expand, single
 
-LINK_STEPS = 60  # steps that the ids of two junctions take to meet at most
+LINK_STEPS = 96  # cells that an id goes along a branch at most
+LINKS, FRONTIERS = 12, 6  # of a scan at most
+LINE = 9  # points K of a line
+FINE = 4  # finer than the points of its line is a link measured
+TWIN = 0.6  # [m] lines that are somewhere this far apart are two links, not one
+SMOOTH = 4  # times that the staircase of cells is smoothed
 
 
 class Links(NamedTuple):
-    """Branches of one diagram that join two of its junctions, padded to P; robot frame."""
+    """Branches of one diagram that leave its junctions, padded to P; robot frame."""
 
-    pair: Array  # (P, 2) int32 indices of the features they join
-    via: Array  # (P, 2) [m] a point half-way
-    clearance: Array  # (P,) [m] the smaller of that point and of both ends
+    pair: Array  # (P, 2) int32 features they join, the smaller first; -1 second at a frontier
+    line: Array  # (P, K, 2) [m] points at equal distances, from the first end to the second
+    length: Array  # (P,) [m] along the branch
+    clearance: Array  # (P,) [m] smallest along it, both ends included
     valid: Array  # (P,) bool
+
+
+def gap(one: Array, other: Array) -> Array:
+    """Largest distance (...) [m] between two lines (..., K, 2), point by point."""
+    return jnp.max(jnp.linalg.norm(one - other, axis=-1), axis=-1)
+
+
+def repeated(pair: Array, line: Array, valid: Array) -> Array:
+    """Links (P,) bool that have the ends (P, 2) and about the line (P, K, 2) of an earlier one."""
+    same = jnp.all(pair[:, None] == pair[None], axis=2) & (gap(line[:, None], line[None]) < TWIN)
+    earlier = jnp.tril(jnp.ones(same.shape, bool), -1)
+    return jnp.any(same & earlier & valid[None], axis=1)
+
+
+def id_bits(count: int) -> Array:
+    """One bit (N + 1,) for each of N ids and one that no cell holds, in the smallest type.
+
+    Raises:
+        ValueError: There are more than 31 ids.
+    """
+    for bits in (8, 16, 32):
+        if count < bits:
+            return jnp.asarray(2 ** np.arange(count + 1, dtype=np.int64), f"uint{bits}")
+    raise ValueError(f"spec.nodes is {count}: at most 31 junctions can be linked")
+
+
+def _check(
+    found: Nodes,
+    diagram: Diagram,
+    sources: Array,
+    scan: Scan,
+    lidar: Lidar,
+    grid: GridSpec,
+    spec: NodeSpec,
+) -> None:
+    """Raise ValueError if shapes or types do not fit."""
+    if scan.ranges.shape != (lidar.beams,):
+        raise ValueError(f"scan.ranges is {scan.ranges.shape}, not {(lidar.beams,)}")
+    if found.xy.ndim != 2 or found.xy.shape[0] < spec.nodes or found.xy.shape[1] != 2:
+        raise ValueError(f"found.xy is {found.xy.shape}, not (M >= {spec.nodes}, 2)")
+    whole = (("diagram.labels", diagram.labels), ("sources", sources))
+    for name, cells in whole:
+        if cells.shape != grid.shape:
+            raise ValueError(f"{name} is {cells.shape}, not as the grid {grid.shape}")
+    if sources.dtype != bool:
+        raise ValueError(f"sources is {sources.dtype}, not bool")
+
+
+class _Ids(NamedTuple):
+    """The ids of the junctions, expanded along the branches."""
+
+    own: Array  # (H, W) bit sets of ids
+    when: Array  # (H, W) int32 step of arrival, -1 where none arrived
+    branch: Array  # (H, W) bool, cells of branches, one thick
+
+
+def _top(score: Array, count: int, reach: int) -> tuple[Array, Array]:
+    """Cells (count,) of the highest scores (H, W), `reach` cells apart, and which are finite."""
+    h, w = score.shape
+
+    def step(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+        at = jnp.argmax(left).astype(jnp.int32)
+        square = (rows - at // w) ** 2 + (columns - at % w) ** 2
+        return jnp.where(square < reach**2, -jnp.inf, left), (at, left[at] > -jnp.inf)
+
+    rows, columns = jnp.indices((h, w), dtype=jnp.int32).reshape(2, -1)
+    _, (cell, valid) = lax.scan(step, score.reshape(-1), length=count)
+    return cell, valid
 
 
 def find_links(
@@ -33,10 +113,10 @@ def find_links(
     grid: GridSpec,
     spec: NodeSpec,
 ) -> Links:
-    """Which junctions the branches of a diagram join.
+    """Which junctions the branches of a diagram join, and which branches lead out of the view.
 
-    The ids of the junctions expand along the branches, by the same automaton as the fronts before;
-    where two ids meet, an arc is found.
+    Two junctions may have two links, if their branches part. A frontier is the end of a branch
+    that meets no other junction before what the scan did not see, and is not in a corner.
 
     Args:
         found: Features of the scan, junctions first.
@@ -45,41 +125,144 @@ def find_links(
         scan: The scan.
         lidar: The scanner.
         grid: The grid of the diagram.
-        spec: Capacities; at most seven junctions, the bits of a uint8.
+        spec: Capacities; at most 31 junctions.
+
+    Returns:
+        `LINKS` links, then `FRONTIERS` frontiers.
+
+    Raises:
+        ValueError: Shapes do not fit, or there are too many junctions; while tracing.
     """
-    count = spec.nodes
-    place, valid = found.xy[:count], found.valid[:count]
-    middle = centres(grid).astype(place.dtype)
-    near = jnp.linalg.norm(middle[None] - place[:, None, None], axis=-1) < 2.5 * grid.cell
-    near &= valid[:, None, None]  # (N, H, W)
-    bit = jnp.uint8(1) << jnp.arange(count, dtype=jnp.uint8)
-    seeds = jnp.zeros(grid.shape, jnp.uint8)
-    for k in range(count):
-        seeds |= jnp.where(near[k], bit[k], jnp.uint8(0))
-    branch = branches(diagram, sources).astype(jnp.uint8)
-    thick = (block_union(branch) > 0) & (diagram.labels != 0) & ~sources
+    _check(found, diagram, sources, scan, lidar, grid, spec)
+    place, valid = found.xy[: spec.nodes], found.valid[: spec.nodes]
+    place = jnp.where(valid[:, None], place, 0.0)
+    bit = id_bits(spec.nodes)
+    away = jnp.linalg.norm(centres(grid).astype(place.dtype)[None] - place[:, None, None], axis=-1)
+    near = (away < 2.5 * grid.cell) & valid[:, None, None]  # (N, H, W)
+    seeds = jnp.zeros(grid.shape, bit.dtype)
+    for k in range(spec.nodes):
+        seeds |= jnp.where(near[k], bit[k], jnp.zeros_like(bit[k]))
+    branch = branches(diagram, sources)
+    thick = (block_union(branch.astype(jnp.uint8)) > 0) & (diagram.labels != 0) & ~sources
     met = expand(seeds, thick | (seeds != 0), steps=LINK_STEPS)
-    ids, when = met.labels, jnp.where(met.arrival >= 0, met.arrival, LINK_STEPS + 1)
+    ids = _Ids(met.labels, met.arrival, branch)
+
+    unseen = (diagram.labels == 0) & ~sources & ~seen_free(scan, lidar, grid)
+    wide = diagram.arrival > round(spec.least / grid.cell)  # steps, no fewer than cells to a wall
+    reach = round(TWIN / grid.cell)
+    some = [_meets(ids, away, bit, reach), _ends(ids, unseen, wide, bit, reach)]
+    pair, cell, good = (jnp.concatenate(x) for x in zip(*some, strict=True))
+    line, length, clearance = jax.vmap(_measure, in_axes=(0, 0, None, None, None, None, None))(
+        pair, cell, ids, bit, place, grid, jnp.where(scan.hit[:, None], points(scan, lidar), 1e3)
+    )
+    shape = jnp.append(found.shape[: spec.nodes], jnp.inf)
+    clearance = jnp.minimum(clearance, jnp.min(shape[pair], axis=1))
+    good &= (pair[:, 1] >= 0) | (clearance > spec.least)
+    good &= ~repeated(pair, line, good)
+    return Links(pair=pair, line=line, length=length, clearance=clearance, valid=good)
+
+
+def _meets(ids: _Ids, away: Array, bit: Array, reach: int) -> tuple[Array, Array, Array]:
+    """Where two ids meet: their pair (LINKS, 2), a cell (LINKS,), and whether there is one.
+
+    Each pair may meet twice, in places that are far from each other.
+    """
     # An even meet: one id here, another next door.
-    beside = jnp.zeros_like(ids)
-    for other in around(single(ids)):
+    beside = jnp.zeros_like(ids.own)
+    for other in around(single(ids.own)):
         beside |= other
-    both = ids | jnp.where(single(ids) != 0, beside, jnp.uint8(0))
+    both = ids.own | jnp.where(single(ids.own) != 0, beside, jnp.zeros_like(beside))
+    early = -ids.when.astype(away.dtype) - jnp.where(ids.branch, 0.0, 2.5).astype(away.dtype)
+    first, second = (jnp.asarray(k, jnp.int32) for k in np.triu_indices(len(bit) - 1, 1))
 
-    first, second = np.triu_indices(count, 1)
-    hits = points(scan, lidar)
-
-    def link(i: Array, j: Array) -> tuple[Array, Array, Array]:
+    def meet(i: Array, j: Array) -> tuple[Array, Array, Array]:
         want = bit[i] | bit[j]
-        here = jnp.where(both & want == want, when, LINK_STEPS + 1).reshape(-1)
-        at = jnp.argmin(here)
-        via = centre_of(jnp.stack([at // grid.shape[1], at % grid.shape[1]]), grid)
-        via = via.astype(place.dtype)
-        away = jnp.linalg.norm(hits - via[None], axis=1)
-        room = jnp.min(jnp.where(scan.hit, away, jnp.inf))
-        room = jnp.minimum(room, jnp.minimum(found.shape[i], found.shape[j]))
-        return via, room, (here[at] <= LINK_STEPS) & valid[i] & valid[j]
+        score = jnp.where(both & want == want, early - 1e-3 * (away[i] + away[j]), -jnp.inf)
+        cell, valid = _top(score, 2, reach)
+        return cell, valid, score.reshape(-1)[cell]
 
-    via, room, joined = jax.vmap(link)(jnp.asarray(first), jnp.asarray(second))
-    pair = jnp.stack([jnp.asarray(first), jnp.asarray(second)], axis=1).astype(jnp.int32)
-    return Links(pair=pair, via=via, clearance=room, valid=joined)
+    cell, valid, score = (x.reshape(-1) for x in jax.vmap(meet)(first, second))
+    order = jnp.argsort(~valid | (score == -jnp.inf), stable=True)
+    order = jnp.resize(order, LINKS) if len(order) < LINKS else order[:LINKS]
+    pair = jnp.repeat(jnp.stack([first, second], axis=1), 2, axis=0)
+    return pair[order], cell[order], valid[order]
+
+
+def _ends(
+    ids: _Ids, unseen: Array, wide: Array, bit: Array, reach: int
+) -> tuple[Array, Array, Array]:
+    """Where branches leave the view: pairs (FRONTIERS, 2) of id and -1, cells, and whether.
+
+    Such an end is farther from its junction than the cells around it, and next to unseen ones.
+    """
+    own = single(ids.own)
+    around_it = block_union(block_union(ids.own))
+    edge = block_union(block_union(jnp.pad(unseen, 1, constant_values=True).astype(jnp.uint8)))
+    far = jnp.where(ids.when >= 0, 2 * ids.when + ids.branch.astype(jnp.int32), -1)
+    farthest = lax.reduce_window(far, jnp.int32(-1), lax.max, (7, 7), (1, 1), "SAME")
+    end = (own != 0) & (around_it == own) & (ids.when > 0) & (far == farthest)
+    end &= (edge[1:-1, 1:-1] > 0) & wide
+    cell, valid = _top(jnp.where(end, far.astype(float), -jnp.inf), FRONTIERS, reach)
+    node = jnp.argmax(own.reshape(-1)[cell][:, None] == bit[None, :-1], axis=1).astype(jnp.int32)
+    return jnp.stack([node, jnp.full_like(node, -1)], axis=1), cell, valid
+
+
+def _back(cell: Array, own: Array, ids: _Ids) -> tuple[Array, Array]:
+    """Cells (S,) from `cell` back to where the id with the bit `own` came from, and if it moved.
+
+    Each step goes to a cell that the id reached earlier: on the branch where one is.
+    """
+    w = ids.when.shape[1] + 2  # a ring of cells around
+    own_at = jnp.pad(ids.own, 1).reshape(-1)
+    when = jnp.pad(ids.when, 1, constant_values=-1).reshape(-1)
+    price = when * 2 - 5 * jnp.pad(ids.branch, 1).reshape(-1).astype(jnp.int32)
+    beside = jnp.array([-w - 1, -w, -w + 1, -1, 1, w - 1, w, w + 1], jnp.int32)
+
+    def step(now: tuple[Array, Array], _: None):
+        at, limit = now
+        near = at + beside
+        good = (own_at[near] == own) & (when[near] < limit)
+        best = near[jnp.argmin(jnp.where(good, price[near], jnp.iinfo(jnp.int32).max))]
+        moved = jnp.any(good)
+        at = jnp.where(moved, best, at)
+        return (at, jnp.where(moved, when[at], limit)), (at, moved)
+
+    start = (cell // (w - 2) + 1) * w + cell % (w - 2) + 1
+    # The first step may go to a cell that was reached as early: an even meet.
+    _, (at, moved) = lax.scan(step, (start, when[start] + 1), length=LINK_STEPS)
+    return (at // w - 1) * (w - 2) + at % w - 1, moved
+
+
+def _measure(
+    pair: Array, cell: Array, ids: _Ids, bit: Array, place: Array, grid: GridSpec, hits: Array
+) -> tuple[Array, Array, Array]:
+    """Line (K, 2), length and clearance of the link of a `pair` (2,) that met in a `cell`."""
+    at = lambda flat: centre_of(
+        jnp.stack([flat // grid.shape[1], flat % grid.shape[1]], axis=-1), grid
+    ).astype(place.dtype)
+    middle = at(cell)
+    sides = []
+    for end in (pair[0], pair[1]):
+        # The last bit is nobody's: from a frontier, nothing leads back to a second end.
+        cells, moved = _back(cell, bit[jnp.where(end < 0, len(bit) - 1, end)], ids)
+        last = jnp.where(end < 0, middle, place[end])
+        way = jnp.where(moved[:, None], at(cells), last[None])
+        sides.append((jnp.concatenate([way, last[None]]), jnp.append(~moved, True)))
+    (there, there_fixed), (back, back_fixed) = sides
+    way = jnp.concatenate([there[::-1], middle[None], back])
+    fixed = jnp.concatenate([there_fixed[::-1], pair[1:] < 0, back_fixed])
+    for _ in range(SMOOTH):
+        mean = (way[:-2] + 2.0 * way[1:-1] + way[2:]) / 4.0
+        way = way.at[1:-1].set(jnp.where(fixed[1:-1, None], way[1:-1], mean))
+    fine = resample(way, FINE * (LINE - 1) + 1)
+    length = jnp.sum(jnp.linalg.norm(jnp.diff(fine, axis=0), axis=1))
+    room = jnp.min(jnp.linalg.norm(fine[:, None] - hits[None], axis=2))
+    return fine[::FINE], length, room
+
+
+def resample(way: Array, count: int) -> Array:
+    """Points (count, 2) at equal distances along a polyline (n, 2) [m], its ends included."""
+    size = jnp.sqrt(jnp.sum(jnp.diff(way, axis=0) ** 2, axis=1))
+    along = jnp.concatenate([jnp.zeros(1, size.dtype), jnp.cumsum(size)])
+    want = along[-1] * jnp.linspace(0.0, 1.0, count, dtype=size.dtype)
+    return jnp.stack([jnp.interp(want, along, way[:, k]) for k in range(2)], axis=1)

@@ -1,11 +1,14 @@
-"""Routes over a graph of places, and how to follow a path."""
+"""Routes over a map, and how to follow a path."""
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csgraph
 
+from jaxslam import ways
 from jaxslam.geometry import range_bearing, to_robot
 from jaxslam.motion import arc
+from jaxslam.topomap import Graph
 from jaxslam.types import Array
 
 WINDOW = 40  # points of the path ahead of the robot that are looked at
@@ -14,7 +17,13 @@ CLOSE = 0.05  # [m] from the end of its path the robot stops
 
 
 def densify(waypoints: np.ndarray, spacing: float = 0.05) -> np.ndarray:
-    """Points (N, 2) about `spacing` [m] apart on the straight lines that join way points (K, 2)."""
+    """Points (N, 2) about `spacing` [m] apart on the straight lines that join way points (K, 2).
+
+    Raises:
+        ValueError: The way points have another shape.
+    """
+    if np.ndim(waypoints) != 2 or len(waypoints) < 1 or np.shape(waypoints)[1] != 2:
+        raise ValueError(f"waypoints is {np.shape(waypoints)}, not (K >= 1, 2)")
     legs = np.hypot(*np.diff(waypoints, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(legs)])
     at = np.linspace(0.0, along[-1], round(along[-1] / spacing) + 1)
@@ -47,7 +56,14 @@ def follow(
 
     Returns:
         Motion (3,), zero at the end of the path, and the index () int32 of the nearest path point.
+
+    Raises:
+        ValueError: The path or the pose has another shape; while tracing.
     """
+    if path.ndim != 2 or path.shape[1] != 2:
+        raise ValueError(f"path is {path.shape}, not (N, 2)")
+    if pose.shape != (3,):
+        raise ValueError(f"pose is {pose.shape}, not (3,)")
     last = path.shape[0] - 1
     index = jnp.minimum(place + jnp.arange(WINDOW, dtype=place.dtype), last)
     offset = path[index] - pose[None, :2]
@@ -72,33 +88,31 @@ def follow(
     return arc(length, jnp.where(done, 0.0, swing)), place
 
 
-def route(
-    positions: np.ndarray, pairs: np.ndarray, lengths: np.ndarray, start: int, goal: int
-) -> list[int]:
-    """Places on the shortest way from `start` to `goal`, both included.
+class Route(NamedTuple):
+    """A way over a map."""
+
+    nodes: list[int]  # indices of its nodes, in order
+    arcs: list[int]  # indices of the arcs between them
+    line: np.ndarray  # (n, 2) [m, world]
+    length: float  # [m]
+
+
+def route(graph: Graph, start: int, goal: int, *, clearance: float = 0.0) -> Route:
+    """The shortest way over a map.
 
     Args:
-        positions: (L, 2) of the places [m].
-        pairs: (A, 2) int, the two places each arc joins; two places may share several arcs.
-        lengths: (A,) of the arcs [m].
-        start: Index of the first place.
-        goal: Index of the last place.
+        graph: The map.
+        start: Index of the first node.
+        goal: Index of the last node.
+        clearance: Clearance [m] that each arc must have; above 0, arcs without a known one are
+            not used.
 
     Raises:
-        ValueError: No arcs lead from `start` to `goal`.
+        ValueError: No arcs of that clearance lead from `start` to `goal`, or there is no such node.
     """
-    count = len(positions)
-    for place in (start, goal):
-        if not 0 <= place < count:
-            raise ValueError(f"no place {place}: the map has the places 0 to {count - 1}")
-    table = np.full((count, count), np.inf)
-    ends = np.asarray(pairs, int).reshape(-1, 2)
-    np.minimum.at(table, (ends[:, 0], ends[:, 1]), lengths)
-    graph = csgraph.csgraph_from_dense(table, null_value=np.inf)
-    before = csgraph.dijkstra(graph, directed=False, indices=start, return_predecessors=True)[1]
-    way = [int(goal)]
-    while way[-1] != start:
-        if before[way[-1]] < 0:
-            raise ValueError(f"no route leads from place {start} to place {goal}")
-        way.append(int(before[way[-1]]))
-    return way[::-1]
+    wide = (clearance <= 0.0) | (graph.arc_clearance >= clearance)  # NaN compares false
+    lengths = np.where(wide, graph.length, np.inf)
+    arcs = ways.shortest(graph.pairs, lengths, start, goal, places=len(graph.xy))
+    nodes, line = ways.along(graph.lines, graph.pairs, arcs, start)
+    line = line if arcs else graph.xy[[start]]
+    return Route(nodes, arcs, line, float(np.sum(graph.length[arcs])))

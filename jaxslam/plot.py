@@ -9,9 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.transforms import Affine2D
 
 from jaxslam.ekf import Belief
 from jaxslam.grid import GridSpec
+from jaxslam.io.occupancy import Occupancy
 from jaxslam.nodes import Nodes
 from jaxslam.topomap import Graph
 from jaxslam.types import CORNER, NODE
@@ -148,10 +150,9 @@ def _marks(axis: Axes, xy: np.ndarray, cov: np.ndarray, use: np.ndarray, kind: i
 
 
 def arcs(axis: Axes, graph: Graph) -> None:
-    """Draw the arcs of a topological map, each over the point half-way."""
-    lines = np.stack([graph.xy[graph.pairs[:, 0]], graph.via, graph.xy[graph.pairs[:, 1]]], axis=1)
+    """Draw the arcs of a topological map."""
     style = {"colors": GREEN, "linewidths": 1.0, "alpha": 0.6, "zorder": 1.5}
-    axis.add_collection(LineCollection(lines, label="arc", **style))
+    axis.add_collection(LineCollection(graph.lines, label="arc", **style))
 
 
 def errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -> None:
@@ -217,3 +218,45 @@ def extent(*groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = np.concatenate([np.asarray(group)[:, :2] for group in groups])
     points = points[np.isfinite(points).all(axis=1)]
     return points.min(axis=0), points.max(axis=0)
+
+
+def outline(map: Occupancy) -> np.ndarray:
+    """Corners (4, 2) [m, map] of the part of an occupancy grid that is not unknown."""
+    known = np.argwhere(map.occupied | map.free)
+    low, high = known.min(axis=0), known.max(axis=0) + 1
+    return _placing(map).transform([low, (high[0], low[1]), high, (low[0], high[1])])
+
+
+def _placing(map: Occupancy) -> Affine2D:
+    """From cells to the frame of the map."""
+    x, y, heading = np.asarray(map.origin, float)
+    return Affine2D().scale(map.resolution).rotate(heading).translate(x, y)
+
+
+def occupancy(axis: Axes, map: Occupancy) -> None:
+    """Draw an occupancy grid: occupied cells dark, unknown ones grey."""
+    image = np.where(map.free, 255, 205).astype(np.uint8)
+    image[map.occupied] = 60
+    style = {"cmap": "gray", "vmin": 0, "vmax": 255, "interpolation": "none", "zorder": 0.5}
+    extent = (0, image.shape[0], 0, image.shape[1])
+    limits = axis.get_xlim(), axis.get_ylim()
+    axis.set_facecolor((205 / 255,) * 3)
+    axis.imshow(
+        image.T, origin="lower", extent=extent, transform=_placing(map) + axis.transData, **style
+    )
+    axis.set(xlim=limits[0], ylim=limits[1], aspect="equal")
+
+
+def roads(axis: Axes, graph: Graph) -> None:
+    """Draw the topological map of an occupancy grid; junctions and dead ends differ in shape."""
+    style = {"colors": BLUE, "linewidths": 1.1, "zorder": 1.5}
+    axis.add_collection(LineCollection(graph.lines, label="arc", **style))
+    degree = np.bincount(graph.pairs.ravel(), minlength=len(graph.id))
+    for name, marker, color, use in (
+        ("node", "o", RED, degree != 1),
+        ("dead end", "s", ORANGE, degree == 1),
+    ):
+        style = {"color": color, "markersize": 4, "markeredgecolor": "white", "zorder": 2}
+        if use.any():
+            edge = {"markeredgewidth": 0.4, "linestyle": "none"}
+            axis.plot(*graph.xy[use].T, marker, label=name, **style, **edge)

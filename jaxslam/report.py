@@ -10,11 +10,13 @@ import numpy as np
 
 from jaxslam import lidar, metrics
 from jaxslam.io import geojson, tum
+from jaxslam.io.occupancy import Occupancy
 from jaxslam.io.output import write_json
 from jaxslam.io.recording import Recording
 from jaxslam.io.relations import Relations
 from jaxslam.lidar import Scan
 from jaxslam.monte_carlo import Track
+from jaxslam.skeleton import Survey as MapSurvey
 from jaxslam.slam import Config, Survey
 from jaxslam.topomap import Graph
 from jaxslam.types import NODE
@@ -95,10 +97,10 @@ def write(place: Path, numbers: Numbers, times: np.ndarray, survey: Survey) -> N
     """Write the files of numbers that every command has."""
     write_json(place / "metrics.json", numbers)
     tum.write(place / "trajectory.tum", times, poses_of(survey))
-    _write_map(place / "map.geojson", survey.graph)
+    write_map(place / "map.geojson", survey.graph)
 
 
-def _write_map(path: Path, graph: Graph) -> None:
+def write_map(path: Path, graph: Graph) -> None:
     """Write a topological map."""
     nodes = [
         geojson.Node(int(id), float(x), float(y), KINDS[kind], float(c) if kind == NODE else np.nan)
@@ -111,7 +113,7 @@ def _write_map(path: Path, graph: Graph) -> None:
             int(graph.id[b]),
             float(graph.length[k]),
             float(graph.arc_clearance[k]),
-            np.stack([graph.xy[a], graph.via[k], graph.xy[b]]),
+            graph.lines[k],
         )
         for k, (a, b) in enumerate(graph.pairs)
     ]
@@ -200,3 +202,45 @@ def tell(numbers: Numbers, title: str, out: Path) -> None:
     seconds = numbers["seconds"]
     print(f"  {'seconds':30}{seconds['run']:10.1f}, and {seconds['compile']:.1f} to compile")
     print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")
+
+
+def of_map(survey: MapSurvey) -> Numbers:
+    """Numbers of the topological map of an occupancy grid."""
+    graph = survey.graph
+    degree = np.bincount(graph.pairs.ravel(), minlength=len(graph.id))
+    return {
+        "nodes": len(graph.id),
+        "arcs": len(graph.pairs),
+        "dead_ends": int(np.sum(degree == 1)),
+        "rings": len(graph.pairs) - len(graph.id) + survey.regions,
+        "regions": survey.regions,
+        "length_m": float(graph.length.sum()),
+        "narrowest_m": float(min(graph.arc_clearance, default=np.nan)),
+        "reached_m2": survey.reached,
+        "left_out_m2": survey.left_out,
+    }
+
+
+def draw_map(path: Path, occupancy: Occupancy, graph: Graph) -> None:
+    """Draw an occupancy grid with its topological map."""
+    from jaxslam import plot  # matplotlib takes its time to load
+
+    figure, axis = plot.plan(*plot.extent(plot.outline(occupancy)))
+    plot.occupancy(axis, occupancy)
+    plot.roads(axis, graph)
+    plot.legend(figure)
+    figure.savefig(path)
+
+
+def tell_map(numbers: Numbers, title: str, out: Path) -> None:
+    """Print a summary of what `metrics.json` holds of a map."""
+    print(f"\n{title}")
+    print(f"  {'nodes, of them dead ends':30}{numbers['nodes']:10d}{numbers['dead_ends']:10d}")
+    print(f"  {'arcs, rings':30}{numbers['arcs']:10d}{numbers['rings']:10d}")
+    print(f"  {'length of the arcs [m]':30}{numbers['length_m']:10.1f}")
+    if numbers["arcs"]:
+        print(f"  {'smallest clearance [m]':30}{numbers['narrowest_m']:10.2f}")
+    print(f"  {'reached, left out [m^2]':30}{numbers['reached_m2']:10.1f}", end="")
+    print(f"{numbers['left_out_m2']:10.1f}")
+    print(f"  {'seconds':30}{numbers['seconds']['run']:10.1f}")
+    print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, map.graphml")

@@ -255,9 +255,10 @@ def local_maps(config: Config, scans: Scan) -> tuple[Nodes, Links]:
     return map_batches(partial(local_map, config), scans, size=BATCH)
 
 
-@partial(jax.jit, static_argnames="arcs")
-def _arcs(info: Info, joined: Links, *, arcs: int) -> topomap.Arcs:
-    return topomap.build(info.id, info.pose, joined, arcs=arcs)
+@partial(jax.jit, static_argnames="config")
+def _arcs(config: Config, info: Info, joined: Links, scans: Scan) -> topomap.Arcs:
+    start = topomap.empty(arcs=2 * config.landmarks)
+    return topomap.build(start, info.id, info.pose, joined, scans, config.lidar)
 
 
 def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Scan) -> Survey:
@@ -272,8 +273,15 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
     """
     seen, joined = local_maps(config, scans)
     belief, info = run(config, noise, init(config, start), Inputs(motions, seen))
-    arcs = _arcs(info, joined, arcs=2 * config.landmarks)
-    graph = topomap.graph(belief, arcs, np.asarray(info.pose), confirm=config.confirm)
+    arcs = _arcs(config, info, joined, scans)
+    graph = topomap.graph(
+        belief,
+        arcs,
+        np.asarray(info.pose),
+        confirm=config.confirm,
+        apart=config.apart,
+        alike=config.alike_shape,
+    )
     return Survey(belief, info, seen, graph)
 
 

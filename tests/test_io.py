@@ -285,7 +285,8 @@ def test_geojson_is_a_directed_route_graph(tmp_path):
     a, b, there, back = graph["features"]
     assert a["geometry"] == {"type": "Point", "coordinates": [1.5, 2.0]}
     metadata = {"kind": "junction", "clearance": 0.5}
-    assert a["properties"] == {"id": 4, "frame": "odom", "metadata": metadata}
+    named = {"id": 4, "frame": "odom", "metadata": metadata, "operations": {}}
+    assert a["properties"] == named
     assert b["properties"]["metadata"] == {"kind": "end"}  # null would stop nav2_route
     line = [[1.5, 2.0], [2.0, 2.5], [3.0, 2.0]]
     assert there["geometry"] == {"type": "MultiLineString", "coordinates": [line]}

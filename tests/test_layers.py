@@ -7,8 +7,9 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 ORDER = (
-    "types geometry world motion lidar grid voronoi edges nodes junctions links alignment "
-    "association ekf topomap slam plan metrics monte_carlo fit io plot report cli"
+    "types geometry world motion lidar grid voronoi tiles edges global_edges nodes junctions "
+    "links alignment association ekf ways topomap medial skeleton slam plan metrics "
+    "monte_carlo fit io plot report cli"
 ).split()
 DOORS = {"__init__", "__main__"}  # may import everything
 FILES = sorted(HOME.rglob("*.py"))

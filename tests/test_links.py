@@ -10,7 +10,7 @@ import reference
 
 from jaxslam import lidar, links, slam, voronoi, world
 from jaxslam.geometry import to_world
-from jaxslam.grid import cell_of, centres
+from jaxslam.grid import centres
 from jaxslam.plan import densify
 
 CONFIG = slam.Config()
@@ -42,11 +42,22 @@ def scene(walls, pose):
     return found, diagram, sources, scan
 
 
-def joined(links):
-    """Pairs of features that are linked."""
+def all_joined(links):
+    """Pairs of features that are linked, as often as they are."""
     pairs = np.asarray(links.pair)[np.asarray(links.valid)].tolist()
-    assert len(set(map(tuple, pairs))) == len(pairs)
-    return set(map(tuple, pairs))
+    return sorted((i, j) for i, j in pairs if j >= 0)
+
+
+def joined(links):
+    """Pairs of features that are linked, once each."""
+    pairs = all_joined(links)
+    assert len(set(pairs)) == len(pairs)
+    return set(pairs)
+
+
+def frontiers(links):
+    """Indices of the frontiers."""
+    return np.flatnonzero(np.asarray(links.valid) & (np.asarray(links.pair)[:, 1] < 0))
 
 
 def walk(found, diagram, sources):
@@ -97,20 +108,140 @@ def test_junctions_before_the_openings_of_a_corridor_are_joined_one_after_the_ot
 
 
 @pytest.mark.parametrize("walls, pose", [(COMB, IN_COMB), ("fig07", (0.7, 1.3, -0.39))])
-def test_an_arc_is_described_by_its_middle_and_its_narrowest_place(walls, pose):
+def test_a_line_follows_the_branch_cells_from_end_to_end(walls, pose):
     walls = world.named(walls).walls if isinstance(walls, str) else walls
     found, diagram, sources, scan = scene(walls, pose)
     links = find(found, diagram, sources, scan)
     hits = np.asarray(lidar.points(scan, CONFIG.lidar))
-    branch = np.asarray(voronoi.branches(diagram, sources))
-    assert len(joined(links)) == 2
+    cells = MIDDLE[np.asarray(voronoi.branches(diagram, sources))]
+    assert len(joined(links)) == 2 and len(frontiers(links)) >= 2
     for k in np.flatnonzero(links.valid):
-        pair, via = np.asarray(links.pair[k]), np.asarray(links.via[k])
-        room = min(np.linalg.norm(hits - via, axis=1).min(), *np.asarray(found.shape)[pair])
-        np.testing.assert_allclose(links.clearance[k], room, atol=1e-9)
-        assert any(branch[c] for c in reference.block(np.asarray(cell_of(via, GRID)), GRID.shape))
-        ends = np.linalg.norm(np.asarray(found.xy)[pair] - via, axis=1)
-        assert np.all(ends < np.linalg.norm(np.diff(found.xy[pair], axis=0)))
+        line, pair = np.asarray(links.line[k]), np.asarray(links.pair[k])
+        ends = np.asarray(found.xy)[pair[pair >= 0]]
+        np.testing.assert_allclose(line[[0, -1]][: len(ends)], ends, atol=1e-9)
+        steps = np.hypot(*np.diff(line, axis=0).T)
+        assert steps.max() < 1.3 * steps.min()
+        assert steps.sum() <= links.length[k] + 1e-9 < 1.1 * steps.sum()
+        inner = line[np.min(np.linalg.norm(line[:, None] - ends, axis=2), axis=1) > AT]
+        off = np.linalg.norm(inner[:, None] - cells, axis=2).min(axis=1, initial=9.0)
+        assert np.all(off < 1.5 * GRID.cell)
+        # Clearance changes by no more than one moves, so the points bound it.
+        room = np.linalg.norm(line[:, None] - hits, axis=2).min()
+        room = min(room, *np.asarray(found.shape)[pair[pair >= 0]])
+        assert room - steps.max() / 2 < links.clearance[k] <= room + 1e-9
+
+
+def test_a_diagonal_link_is_as_long_as_a_straight_one():
+    """A corridor of walls at any angle: its middle line, whose length steps on cells overrate."""
+    for turn in np.linspace(0.0, 0.75, 4):
+        c, s = np.cos(turn), np.sin(turn)
+        walls = np.asarray(COMB).reshape(-1, 2, 2) @ np.array([[c, s], [-s, c]])
+        place = np.array(IN_COMB[:2]) @ np.array([[c, s], [-s, c]])
+        found, *rest = scene(walls.reshape(-1, 4), (*place, 0.1))
+        links = find(found, *rest)
+        assert len(joined(links)) >= 1
+        for k in np.flatnonzero(np.asarray(links.valid) & (np.asarray(links.pair)[:, 1] >= 0)):
+            chord = np.linalg.norm(np.subtract(*np.asarray(found.xy)[np.asarray(links.pair[k])]))
+            if abs(chord - 2.2) < 0.1:  # next to each other, and the way is nearly straight
+                assert chord < links.length[k] < 1.06 * chord
+
+
+def test_a_branch_that_the_range_cuts_is_a_frontier():
+    short = CONFIG._replace(lidar=CONFIG.lidar._replace(reach=5.0))
+    walls = world.outline([(-0.5, -1.0, 30.0, 1.0), (1.6, 1.0, 3.0, 3.0)])
+    pose = jnp.array([0.1, -0.3, 0.1])
+    scan = lidar.cast(world.World(jnp.asarray(walls)), pose, short.lidar)
+    found, links = jax.jit(slam.local_map, static_argnums=0)(short, scan)
+    (node,) = np.flatnonzero(found.valid[:COUNT])
+    assert not joined(links)
+    ahead = [k for k in frontiers(links) if links.line[k, -1, 0] > 3.5]
+    assert len(ahead) == 1
+    line = np.asarray(to_world(pose, links.line[ahead[0]]))
+    np.testing.assert_allclose(line[-1], [4.9, 0.0], atol=0.2)
+    assert links.pair[ahead[0]].tolist() == [node, -1]
+    away = np.linalg.norm(line[-1] - line[0])
+    assert away <= links.length[ahead[0]] < 1.1 * away
+    assert 0.8 < links.clearance[ahead[0]] < 1.05
+
+
+def test_a_branch_into_a_corner_is_no_frontier():
+    found, *rest = scene(world.outline([(-2.0, -1.5, 3.0, 1.5)]), (0.0, 0.0, 0.0))
+    links = find(found, *rest)
+    assert found.valid[:COUNT].sum() == 1
+    # The branch behind the robot leads out of its view, those into the two corners ahead do not.
+    assert np.all(np.asarray(links.line)[frontiers(links), -1, 0] < 0.3)
+
+
+# A diagram that no scan shows: a square ring around a pillar.
+SQUARE = GRID._replace(ahead=3.0, behind=3.0, side=3.0)
+HALF = (5.45, 1.27)  # [m] length of the ring between two opposite places, and its reach at 45 deg
+
+
+@jax.jit
+def ring(places, valid):
+    """Links of junctions at `places` (7, 2) on the branch between a pillar and the walls."""
+    x, y = jnp.abs(centres(SQUARE)).transpose(2, 0, 1)
+    far = jnp.maximum(x, y)
+    sources = (far > 2.9) | (far < 0.5)
+    labels = jnp.where(far > 2.9, 2, jnp.where(far < 0.5, 1, 0)).astype(jnp.uint8)
+    diagram = voronoi.expand(labels, ~sources, steps=40)
+    spec = CONFIG.nodes._replace(nodes=len(places))
+    found = slam.nodes.Nodes(
+        *[jnp.zeros(len(places), jnp.int32), places, jnp.zeros((len(places), 2, 2))],
+        *[jnp.zeros(len(places)), jnp.zeros(len(places)), jnp.ones(len(places))],
+        *[jnp.full(len(places), 3, jnp.int32), valid, valid],
+    )
+    around = lidar.Lidar(beams=721, first=-np.pi)
+    scan = lidar.Scan(jnp.full(721, 9.0), jnp.zeros(721, bool))
+    return links.find_links(found, diagram, sources, scan, around, SQUARE, spec)
+
+
+def ring_of(*places, size=7):
+    xy = np.full((size, 2), 9.0)
+    xy[: len(places)] = places
+    return ring(jnp.asarray(xy), jnp.arange(size) < len(places))
+
+
+def test_two_branches_around_a_pillar_are_two_links():
+    found = ring_of((1.7, 0.0), (-1.7, 0.0))
+    assert all_joined(found) == [(0, 1), (0, 1)]
+    lines = np.asarray(found.line)[np.asarray(found.valid)]
+    np.testing.assert_allclose(
+        np.asarray(found.length)[np.asarray(found.valid)], HALF[0], atol=0.15
+    )
+    np.testing.assert_allclose(np.sort(lines[:, 4, 1]), [-1.7, 1.7], atol=0.15)
+    np.testing.assert_allclose(np.abs(lines[:, 2]), HALF[1], atol=0.25)
+
+
+def test_a_junction_between_cuts_one_of_two_branches():
+    found = ring_of((1.7, 0.0), (-1.7, 0.0), (0.0, 1.7))
+    assert all_joined(found) == [(0, 1), (0, 2), (1, 2)]
+    k = [p.tolist() for p in found.pair].index([0, 1])
+    assert found.valid[k] and found.line[k, 4, 1] < -1.4
+
+
+def test_ten_junctions_need_wider_cells():
+    turn = np.arange(8) * np.pi / 4
+    ways = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    places = ways * np.where(np.arange(8) % 2, HALF[1] * np.sqrt(2), 1.7)[:, None]
+    found = ring_of(*places, size=10)
+    assert all_joined(found) == sorted([*((k, k + 1) for k in range(7)), (0, 7)])
+    assert links.id_bits(10).dtype == jnp.uint16 and links.id_bits(31).dtype == jnp.uint32
+    with pytest.raises(ValueError, match="spec.nodes is 32"):
+        links.id_bits(32)
+
+
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_links_turn_with_the_places(quarter):
+    c, s = [(0, 1), (-1, 0), (0, -1)][quarter - 1]
+    turn = np.array([[c, -s], [s, c]])
+    places = np.array([(1.7, 0.1), (-1.3, 1.3), (0.2, -1.7)])
+    one, other = ring_of(*places), ring_of(*(places @ turn.T))
+    assert all_joined(one) == all_joined(other) == [(0, 1), (0, 2), (1, 2)]
+    by_pair = lambda x: np.argsort([p[0] * 9 + p[1] for p in np.asarray(x.pair)[:3].tolist()])
+    for a, b in zip(by_pair(one), by_pair(other), strict=True):
+        np.testing.assert_allclose(other.line[b], np.asarray(one.line[a]) @ turn.T, atol=0.12)
+        np.testing.assert_allclose(other.length[b], one.length[a], atol=0.1)
 
 
 def poses_in(name):
@@ -163,9 +294,26 @@ def test_padding_is_invisible(junk):
 
 def test_no_junctions_no_links():
     found, *rest = scene(COMB, IN_COMB)
-    links = find(found._replace(valid=jnp.zeros_like(found.valid)), *rest)
-    assert not links.valid.any()
-    assert links.pair.tolist() == [list(p) for p in combinations(range(COUNT), 2)]
+    none = find(found._replace(valid=jnp.zeros_like(found.valid)), *rest)
+    assert not none.valid.any()
+    shapes = [x.shape for x in none]
+    size = links.LINKS + links.FRONTIERS
+    assert shapes == [(size, 2), (size, links.LINE, 2), (size,), (size,), (size,)]
+
+
+def test_arguments_that_do_not_fit_are_named():
+    found, diagram, sources, scan = scene(COMB, IN_COMB)
+    few = found._replace(xy=found.xy[:3])
+    small = diagram._replace(labels=diagram.labels[:-1])
+    for wrong, told in (
+        ((few, diagram, sources), r"found.xy is \(3, 2\), not \(M >= 6, 2\)"),
+        ((found, small, sources), r"diagram.labels is \(81, 160\), not .* \(82, 160\)"),
+        ((found, diagram, sources.astype(int)), "sources is int64, not bool"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            find(*wrong, scan)
+    with pytest.raises(ValueError, match=r"scan.ranges is \(360,\), not \(361,\)"):
+        find(found, diagram, sources, scan._replace(ranges=scan.ranges[1:]))
 
 
 def test_local_map_is_front_end_and_links_and_maps_over_scans():

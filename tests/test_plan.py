@@ -7,6 +7,7 @@ from test_world import clearance, length
 from jaxslam import world
 from jaxslam.geometry import compose
 from jaxslam.plan import WINDOW, densify, follow, route
+from jaxslam.topomap import Graph
 
 
 def driven(path, start, steps):
@@ -88,30 +89,70 @@ def test_many_robots_follow_at_once_and_gradients_are_finite():
     assert np.isfinite(slope).all()
 
 
-POSITIONS = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [5, 5]])
-PAIRS = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [3, 0]])
+PLACES = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [5, 5]], float)
+PAIRS = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [0, 3]])
+
+
+def graph_of(lengths, clearance=(1.0,) * 5):
+    """A square of five arcs, two of them between the same nodes, and a node apart."""
+    lines = [PLACES[pair] for pair in PAIRS[:4]]
+    lines.append(np.array([PLACES[0], [-1.0, 0.5], PLACES[3]]))
+    return Graph(
+        id=np.arange(5),
+        xy=PLACES,
+        kind=np.zeros(5, int),
+        clearance=np.ones(5),
+        pairs=PAIRS,
+        length=np.array(lengths, float),
+        arc_clearance=np.array(clearance),
+        lines=tuple(lines),
+    )
 
 
 @pytest.mark.parametrize(
-    "lengths, expected",
+    "lengths, nodes, arcs",
     [
-        ([1.0, 1.0, 1.0, 3.0, 4.0], [0, 1, 2]),
-        ([1.0, 5.0, 1.0, 3.0, 4.0], [0, 3, 2]),
-        ([1.0, 3.0, 1.0, 9.0, 2.0], [0, 3, 2]),  # the shorter of two arcs counts
-        ([1.0, 3.0, 0.0, 3.5, 9.0], [0, 3, 2]),  # an arc of no length is an arc
+        ([1.0, 1.0, 1.0, 3.0, 4.0], [0, 1, 2], [0, 1]),
+        ([1.0, 5.0, 1.0, 3.0, 4.0], [0, 3, 2], [3, 2]),
+        ([1.0, 3.0, 1.0, 9.0, 2.0], [0, 3, 2], [4, 2]),  # the shorter of two arcs counts
+        ([1.0, 3.0, 0.0, 3.5, 9.0], [0, 3, 2], [3, 2]),  # an arc of no length is an arc
     ],
 )
-def test_route_is_the_shortest(lengths, expected):
-    assert route(POSITIONS, PAIRS, np.array(lengths), 0, 2) == expected
+def test_route_is_the_shortest_and_its_line_goes_from_end_to_end(lengths, nodes, arcs):
+    found = route(graph_of(lengths), 0, 2)
+    assert (found.nodes, found.arcs) == (nodes, arcs)
+    assert found.length == np.sum(np.array(lengths)[arcs])
+    np.testing.assert_array_equal(found.line[[0, -1]], PLACES[[0, 2]])
+    for place in PLACES[nodes]:
+        assert np.any(np.all(found.line == place, axis=1))
+
+
+def test_a_route_keeps_its_clearance():
+    graph = graph_of([1.0, 1.0, 1.0, 3.0, 4.0], [0.3, 0.9, 0.5, np.nan, 0.6])
+    assert route(graph, 0, 2).arcs == [0, 1]
+    assert route(graph, 0, 2, clearance=0.4).arcs == [4, 2]  # not where none is known
+    with pytest.raises(ValueError, match="no route leads from place 0 to place 2"):
+        route(graph, 0, 2, clearance=0.55)
 
 
 def test_route_there_is_route_back_and_may_be_empty():
-    lengths = np.ones(5)
-    assert route(POSITIONS, PAIRS, lengths, 2, 0) in ([2, 1, 0], [2, 3, 0])
-    assert route(POSITIONS, PAIRS, lengths, 4, 4) == [4]
+    graph = graph_of(np.ones(5))
+    assert route(graph, 2, 0).nodes in ([2, 1, 0], [2, 3, 0])
+    rest = route(graph, 4, 4)
+    assert (rest.nodes, rest.arcs, rest.length) == ([4], [], 0.0)
+    np.testing.assert_array_equal(rest.line, PLACES[[4]])
 
 
 @pytest.mark.parametrize("goal, line", [(4, "no route leads from place 0 to place 4"), (9, "9")])
 def test_a_route_that_does_not_exist_is_refused(goal, line):
     with pytest.raises(ValueError, match=line):
-        route(POSITIONS, PAIRS, np.ones(5), 0, goal)
+        route(graph_of(np.ones(5)), 0, goal)
+
+
+def test_arguments_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match=r"waypoints is \(3,\), not \(K >= 1, 2\)"):
+        densify(np.zeros(3))
+    with pytest.raises(ValueError, match=r"path is \(5, 3\), not \(N, 2\)"):
+        follow(jnp.zeros((5, 3)), jnp.int32(0), jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"pose is \(2,\), not \(3,\)"):
+        follow(jnp.zeros((5, 2)), jnp.int32(0), jnp.zeros(2))

@@ -58,7 +58,7 @@ def test_an_ellipse_is_turned_as_its_covariance(axis, angle):
     assert drawn.get_widths()[0] == pytest.approx(2 * 3 * 0.5)
 
 
-def test_arcs_go_over_the_point_half_way(axis):
+def test_arcs_are_drawn_along_their_lines(axis):
     graph = Graph(
         id=np.array([5, 8]),
         xy=np.array([[0.0, 0.0], [2.0, 0.0]]),
@@ -67,7 +67,7 @@ def test_arcs_go_over_the_point_half_way(axis):
         pairs=np.array([[0, 1]]),
         length=np.array([2.8]),
         arc_clearance=np.ones(1),
-        via=np.array([[1.0, 1.0]]),
+        lines=(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 0.0]]),),
     )
     plot.arcs(axis, graph)
     (drawn,) = of_type(axis, LineCollection)
@@ -76,7 +76,7 @@ def test_arcs_go_over_the_point_half_way(axis):
 
 def test_an_empty_map_draws_nothing(axis):
     none = Graph(*(np.zeros(shape) for shape in ((0,), (0, 2), (0,), (0,))),
-                 np.zeros((0, 2), int), np.zeros(0), np.zeros(0), np.zeros((0, 2)))  # fmt: skip
+                 np.zeros((0, 2), int), np.zeros(0), np.zeros(0), ())  # fmt: skip
     plot.arcs(axis, none)
     plot.landmarks(axis, ekf.initial(jnp.zeros(3), landmarks=4), confirm=2)
     axis.figure.draw_without_rendering()

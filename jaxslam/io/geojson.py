@@ -82,10 +82,15 @@ def _check(nodes: Sequence[Node], arcs: Sequence[Arc]) -> None:
 
 def _node_feature(node: Node, frame: str) -> dict[str, Any]:
     """GeoJSON of a node."""
-    metadata = {"kind": node.kind, **_clearance(node.clearance)}
+    properties = {
+        "id": int(node.id),
+        "frame": frame,
+        "metadata": {"kind": node.kind, **_clearance(node.clearance)},
+        "operations": {},
+    }
     return {
         "type": "Feature",
-        "properties": {"id": int(node.id), "frame": frame, "metadata": metadata},
+        "properties": properties,
         "geometry": {"type": "Point", "coordinates": [float(node.x), float(node.y)]},
     }
 

@@ -1,95 +1,179 @@
-"""Speed of the whole chain and of its parts, batched, on one core, after compilation.
+"""Speed of the whole chain, of the front end and of the automaton, on one core, after compilation.
 
-Ray casting, front end and filter of runs of the office drive. Seconds depend on the machine;
-the shares of the parts, measured in one run, depend on it little.
+Ray casting, front end and filter of runs of the office drive; the stages of the front end; the
+automaton beside hand-written C and other libraries (`pip install '.[bench]'`). Seconds depend on
+the machine; shares and ratios, measured in one run, depend on it little.
 """
 
-import os
-import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from experiments.one_core import least, seconds  # isort: skip  # before JAX starts its threads
 
 import jax
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 
-from experiments import common
-from jaxslam import monte_carlo, slam
-from jaxslam.lidar import cast
+from experiments import common, peers
+from jaxslam import edges, junctions, monte_carlo, nodes, slam, voronoi
+from jaxslam.grid import seen_free
+from jaxslam.lidar import Scan, cast
 from jaxslam.slam import map_batches
 
-REPEATS = 3
+LOOKED_AT = 512  # scans at most that the front end is timed on
 
 
-def best_of(function, *arguments) -> float:
-    """Least seconds of a few calls, compilation left out."""
-    jax.block_until_ready(function(*arguments))
-    taken = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        taken.append(time.perf_counter() - begin)
-    return min(taken)
+def batched(function: Callable) -> Callable:
+    """`function` of one item, compiled for many, as everywhere in batches of `slam.BATCH`."""
+    return jax.jit(lambda *items: map_batches(lambda x: function(*x), items, size=slam.BATCH))
 
 
-def compute(seed: int, runs: int) -> common.Numbers:
-    """Scans a second of the chain, and the milliseconds a scan of its parts."""
+def chain(seed: int, runs: int, repeats: int) -> tuple[common.Numbers, Scan]:
+    """Scans a second of the chain, and the milliseconds a scan of its parts; and its scans."""
     config = slam.Config()
     place, robot, path, steps = common.scene()
     noise = slam.wheel_noise(robot)
     keys = monte_carlo.run_keys(jax.random.key(seed), np.arange(runs))
 
-    def simulate(keys):
+    def simulate(keys: jax.Array) -> monte_carlo.Log:
         return monte_carlo.simulate_keys(keys, config, place, robot, path, steps=steps)
 
     logs = simulate(keys)
-
-    @jax.jit
-    def scans(truth):
-        see = lambda pose: cast(place, pose, config.lidar)
-        return map_batches(see, truth.reshape(-1, 3), size=slam.BATCH)
-
-    @jax.jit
-    def features(scans):
-        return map_batches(lambda scan: slam.front_end(config, scan), scans, size=slam.BATCH)
-
-    seconds = {
-        "chain": best_of(lambda k: monte_carlo.tracks(config, noise, simulate(k)), keys),
-        "ray_casting": best_of(scans, logs.truth),
-        "front_end": best_of(features, scans(logs.truth)),
-        "filter": best_of(lambda logs: monte_carlo.tracks(config, noise, logs), logs),
+    poses = logs.truth.reshape(-1, 3)
+    see = batched(lambda pose: cast(place, pose, config.lidar))
+    scans = see(poses)
+    calls = {
+        "chain": (lambda k: monte_carlo.tracks(config, noise, simulate(k)), keys),
+        "ray_casting": (see, poses),
+        "front_end": (batched(partial(slam.front_end, config)), scans),
+        "filter": (lambda logs: monte_carlo.tracks(config, noise, logs), logs),
     }
+    taken = least(calls, repeats=repeats)
     count = runs * steps
-    return {
-        "seed": seed,
+    numbers = {
         "runs": runs,
         "scans": count,
+        "scans_per_second": count / taken["chain"],
+        "ms_per_scan": {name: 1e3 * s / count for name, s in taken.items()},
+        "share_of_chain": {name: s / taken["chain"] for name, s in taken.items()},
+    }
+    return numbers, jax.tree.map(lambda x: x[:LOOKED_AT], scans)
+
+
+def stages(config: slam.Config, scans: Scan) -> dict[str, tuple]:
+    """The stages of `slam.look` with run labels: what each does to all scans, and its inputs."""
+    lidar, grid, spec = config.lidar, config.grid, config.nodes
+
+    def cells(scan: Scan, runs: edges.Runs) -> tuple[jax.Array, jax.Array]:
+        return edges.run_bits(scan, lidar, runs, grid), seen_free(scan, lidar, grid)
+
+    def found(labels: jax.Array, diagram: voronoi.Diagram, scan: Scan, runs: edges.Runs) -> Any:
+        near = voronoi.junctions(diagram, labels != 0)
+        return junctions.find_junctions(near, scan, runs, lidar, grid, spec)
+
+    def others(runs: edges.Runs) -> tuple[nodes.Nodes, nodes.Nodes]:
+        return nodes.find_corners(runs, spec), nodes.find_walls(runs, spec)
+
+    runs_of = batched(lambda scan: edges.runs(scan, lidar, config.runs))
+    cells_of = batched(cells)
+    grow = batched(partial(voronoi.expand, steps=config.steps))
+    runs = runs_of(scans)
+    labels, open = cells_of(scans, runs)
+    return {
+        "runs": (runs_of, scans),
+        "labels_and_free_cells": (cells_of, scans, runs),
+        "automaton": (grow, labels, open),
+        "junctions": (batched(found), labels, grow(labels, open), scans, runs),
+        "corners_and_walls": (batched(others), runs),
+    }
+
+
+def compile_seconds(config: slam.Config, scans: Scan) -> float:
+    """Seconds to trace and compile the front end, nothing of it kept from before."""
+    kept = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()
+    jax.clear_caches()
+    try:
+        return seconds(lambda: batched(partial(slam.front_end, config)).lower(scans).compile())
+    finally:
+        jax.config.update("jax_enable_compilation_cache", kept)
+        compilation_cache.reset_cache()
+
+
+def front_end(scans: Scan, maps: int, repeats: int) -> common.Numbers:
+    """Speed of the front end and its stages on given scans, and of the automaton by itself."""
+    config = slam.Config()
+    whole = batched(partial(slam.front_end, config))
+    parts = stages(config, scans)
+    taken = least({"whole": (whole, scans)} | parts, repeats=repeats)
+    total, count = sum(taken[name] for name in parts), len(scans.ranges)
+    return {
+        "beams": config.lidar.beams,
+        "labels": config.labels,
+        "scans": count,
+        "scans_per_s": count / taken["whole"],
+        "ms_per_scan": {name: 1e3 * s / count for name, s in taken.items()},
+        "share": {name: taken[name] / total for name in parts},
+        "compile_s": compile_seconds(config, scans),
+        **peers.automaton(maps, repeats),
+        "peers": peers.table(maps, repeats),
+    }
+
+
+def compute(seed: int, runs: int, maps: int, repeats: int) -> common.Numbers:
+    """All numbers, by what they are of."""
+    of_chain, scans = chain(seed, runs, repeats)
+    return {
+        "seed": seed,
         "cores": 1,
-        "scans_per_second": count / seconds["chain"],
-        "ms_per_scan": {name: 1e3 * s / count for name, s in seconds.items()},
-        "share_of_chain": {name: s / seconds["chain"] for name, s in seconds.items()},
+        "chain": of_chain,
+        "front_end": front_end(scans, maps, repeats),
     }
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """Bars of the time of each part."""
-    figure, axes = common.canvas(7, 2.6, 1, 1)
-    parts = numbers["ms_per_scan"]
-    names = list(parts)[::-1]
-    bars = axes[0, 0].barh(names, [parts[name] for name in names], color=common.SKY)
-    axes[0, 0].bar_label(bars, fmt="%.2f")
-    axes[0, 0].set(xlabel="milliseconds a scan, one core")
+    """Bars: time of each part of the chain and of the front end, and the automaton's peers."""
+    figure, axes = common.canvas(11, 5.6, 2, 2)
+    of = numbers["front_end"]
+    bars(axes[0, 0], numbers["chain"]["ms_per_scan"], "%.2f", "chain: milliseconds a scan")
+    bars(axes[0, 1], of["ms_per_scan"], "%.3f", "front end: milliseconds a scan")
+    own = {name.replace("_", " "): ms for name, ms in of["ms_per_map"].items() if ms is not None}
+    bars(axes[1, 0], own, "%.3f", f"automaton and C, {of['steps']} steps: milliseconds a map")
+    rows = {name: row for name, row in of["peers"].items() if isinstance(row, dict)}
+    rows = dict(sorted(rows.items(), key=lambda item: item[1]["ms_in_batch"]))
+    batch = {name: row["ms_in_batch"] for name, row in rows.items()}
+    bars(axes[1, 1], batch, "%.3g", f"batch of {of['batch']}: milliseconds a map")
+    axes[1, 1].set_xscale("log")
+    axes[1, 1].margins(x=0.25)
     figure.savefig(path)
+
+
+def bars(axis: Any, values: dict[str, float], form: str, title: str) -> None:
+    """Horizontal bars with their values, the first on top."""
+    names = list(values)[::-1]
+    drawn = axis.barh([n.replace("_", " ") for n in names], [values[n] for n in names])
+    for bar in drawn:
+        bar.set_color(common.SKY)
+    axis.bar_label(drawn, fmt=form, padding=2)
+    axis.margins(x=0.15)
+    axis.set_title(title + ", one core", fontsize=10)
 
 
 def main(argv: list[str] | None = None) -> None:
     """Run the benchmark."""
-    given = common.parse(__doc__, argv, runs=8)
-    numbers = compute(given.seed, given.runs)
+    given = common.parse(__doc__, argv, runs=4, maps=256, repeats=3)
+    numbers = compute(given.seed, given.runs, given.maps, given.repeats)
     common.save(given.out, "benchmark", numbers, draw)
-    print(f"{numbers['scans_per_second']:.0f} scans a second on one core")
-    print({name: f"{100 * share:.0f} %" for name, share in numbers["share_of_chain"].items()})
+    of_chain, of_front = numbers["chain"], numbers["front_end"]
+    percent = lambda shares: {name: f"{100 * share:.0f} %" for name, share in shares.items()}
+    print(f"{of_chain['scans_per_second']:.0f} scans a second on one core")
+    print(percent(of_chain["share_of_chain"]))
+    print(f"front end: {of_front['scans_per_s']:.0f} scans a second", percent(of_front["share"]))
+    ratio = {name: x for name, x in of_front.items() if name.startswith("automaton")}
+    print({name: x if x is None else round(x, 2) for name, x in ratio.items()})
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from jax import lax
 from jaxslam.geometry import cross, dot, unit
 from jaxslam.grid import Grid, GridSpec, cell_of, centres
 from jaxslam.lidar import Lidar, Scan, points
-from jaxslam.types import Array
+from jaxslam.types import Array, expect
 from jaxslam.voronoi import around
 
 # Code of each pattern of occupied neighbours, bits N=1 E=2 S=4 W=8 with the sensor axis to the
@@ -28,9 +28,13 @@ def codes(grid: Grid, spec: GridSpec) -> Array:
     the side of the sensor axis they lie on. Patterns that face away from the sensor cannot be
     seen by it and count as the one they mirror.
 
+    Raises:
+        ValueError: The grid has another shape or type than `spec` says; while tracing.
+
     References:
         Paper, section 2.2, Figs. 3 to 5.
     """
+    expect("grid.occupied", grid.occupied, spec.shape, jnp.bool_)
     north, south, west, east = around(grid.occupied.astype(jnp.uint8))
     pattern = north + 2 * east + 4 * south + 8 * west
     code = jnp.array(_CODES, jnp.uint8)[pattern]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.lidar import Lidar, Scan, points
-from jaxslam.types import Array
+from jaxslam.types import Array, expect
 
 
 class GridSpec(NamedTuple):
@@ -58,7 +58,12 @@ def centres(spec: GridSpec) -> Array:
 
 
 def seen_free(scan: Scan, lidar: Lidar, spec: GridSpec) -> Array:
-    """Cells (H, W) whose centre both bracketing beams pass."""
+    """Cells (H, W) whose centre both bracketing beams pass.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    expect("scan.ranges", scan.ranges, (lidar.beams,), jnp.floating)
     # Which beams these are is a matter of static values, so NumPy works it out while tracing.
     x, y = (np.indices(spec.shape) + 0.5) * spec.cell + corner(spec)[:, None, None]
     beam = (np.arctan2(y, x) - lidar.first) / lidar.step
@@ -79,7 +84,11 @@ def rasterise(scan: Scan, lidar: Lidar, spec: GridSpec) -> Grid:
 
     The second cell of a wall lies behind the first, away from the sensor along the dominant axis
     of the beam, along both where their ratio is at least one half; it never covers a free cell.
+
+    Raises:
+        ValueError: Ranges or hits are not those of one scan of this lidar; while tracing.
     """
+    expect("scan.hit", scan.hit, (lidar.beams,), jnp.bool_)
     xy = points(scan, lidar)
     nowhere = jnp.array(spec.shape, jnp.int32)[None]
     index = jnp.where(scan.hit[:, None], cell_of(xy, spec), nowhere)

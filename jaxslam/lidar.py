@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.geometry import cross, unit
-from jaxslam.types import Array, Key
+from jaxslam.types import Array, Key, expect
 from jaxslam.world import World
 
 SEAM = 1e-5  # part of a wall's length
@@ -36,7 +36,12 @@ def bearings(lidar: Lidar) -> Array:
 
 
 def points(scan: Scan, lidar: Lidar) -> Array:
-    """Ends (R, 2) [m] of the beams in the robot frame."""
+    """Ends (R, 2) [m] of the beams in the robot frame.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    expect("scan.ranges", scan.ranges, (lidar.beams,), jnp.floating)
     return scan.ranges[:, None] * unit(bearings(lidar))
 
 
@@ -46,7 +51,17 @@ def cast(world: World, pose: Array, lidar: Lidar) -> Scan:
     A beam along unit vector u from p meets the wall a + s (b - a), 0 <= s <= 1, at the distance
     t = (a - p) x (b - a) / (u x (b - a)). Walls are stretched by `SEAM` of their length, so that no
     beam slips between two that share a corner.
+
+    Args:
+        world: The walls.
+        pose: (3,) [m, m, rad] of the lidar in the world.
+        lidar: The scanner.
+
+    Raises:
+        ValueError: Walls or pose have another shape or type; while tracing.
     """
+    expect("world.walls", world.walls, ("S", 4), jnp.floating)
+    expect("pose", pose, (3,), jnp.floating)
     beam = unit(pose[2] + bearings(lidar))[:, None, :]  # (R, 1, 2)
     start = (world.walls[:, :2] - pose[None, :2])[None]  # (1, S, 2)
     along = (world.walls[:, 2:] - world.walls[:, :2])[None]  # (1, S, 2)
@@ -61,7 +76,12 @@ def cast(world: World, pose: Array, lidar: Lidar) -> Scan:
 
 
 def limit(ranges: Array, lidar: Lidar) -> Scan:
-    """Scan of raw ranges (R,) [m]; NaN, infinite or beyond the reach means nothing returned."""
+    """Scans of raw ranges (..., R) [m]; NaN, infinite or beyond the reach means nothing returned.
+
+    Raises:
+        ValueError: The ranges are not those of this lidar's beams; while tracing.
+    """
+    expect("ranges", ranges, (..., lidar.beams), jnp.floating)
     hit = (ranges > 0.0) & (ranges < lidar.reach)  # NaN compares false
     return Scan(ranges=jnp.where(hit, ranges, lidar.reach), hit=hit)
 

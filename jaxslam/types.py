@@ -10,7 +10,11 @@ in the world; a motion (3,) is a pose in the frame of the pose before it.
 Grids: cell [i, j] covers a square of the robot frame; i grows with x (ahead), j with y (left).
 """
 
+from typing import Any
+
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 Array = jax.Array
 """Any array; its shape, unit and frame stand in the docstring of what uses it."""
@@ -20,3 +24,28 @@ Key = jax.Array
 
 NODE, CORNER, WALL = 0, 1, 2
 """The kinds of landmark: junction of the Voronoi diagram, corner of two walls, wall direction."""
+
+
+def expect(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> None:
+    """Raise ValueError unless `x` has a shape and a type; while tracing, so it costs no run time.
+
+    Args:
+        name: Of `x`, for the message.
+        x: An array.
+        shape: Its sizes; a letter stands for any size, `...` in front for any leading sizes.
+        kind: Its dtype or a family of dtypes, such as `jnp.floating`; None for any.
+
+    Raises:
+        ValueError: It has not; the message tells what it is and what it should be.
+    """
+    sizes, dtype = np.shape(x), jnp.result_type(x)
+    last = shape[1:] if shape[:1] == (...,) else shape
+    ends = sizes[-len(last) :] if last is not shape else sizes
+    fits = len(ends) == len(last) and all(
+        isinstance(want, str) or size == want for size, want in zip(ends, last, strict=True)
+    )
+    if not fits or not (kind is None or jnp.issubdtype(dtype, kind)):
+        wanted = ", ".join("..." if n is ... else str(n) for n in shape)
+        wanted += "," if len(shape) == 1 else ""
+        of = "" if kind is None else f"{np.dtype(kind) if kind is jnp.bool_ else kind.__name__} "
+        raise ValueError(f"{name} is {dtype} {sizes}, not {of}({wanted})")

@@ -6,14 +6,17 @@ four neighbours that hold exactly one label. A cell that holds a label keeps it,
 cell passes nothing on, which makes the diagonal bisector of the Manhattan distance one cell thin.
 """
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 
-from jaxslam.types import Array
+from jaxslam.types import Array, expect
 
 
 class Diagram(NamedTuple):
@@ -30,8 +33,12 @@ def single(labels: Array) -> Array:
 
 def around(cells: Array) -> tuple[Array, Array, Array, Array]:
     """The four neighbours (H, W) of every cell: next and previous row, next and previous column."""
-    p = jnp.pad(cells, 1)
-    return p[2:, 1:-1], p[:-2, 1:-1], p[1:-1, 2:], p[1:-1, :-2]
+    return _beside(jnp.pad(cells, 1))
+
+
+def _beside(cells: Array) -> tuple[Array, Array, Array, Array]:
+    """`around` of the inner cells (H, W) of (H + 2, W + 2)."""
+    return cells[2:, 1:-1], cells[:-2, 1:-1], cells[1:-1, 2:], cells[1:-1, :-2]
 
 
 def block_union(labels: Array) -> Array:
@@ -41,44 +48,119 @@ def block_union(labels: Array) -> Array:
     return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
 
 
+EMPTY, SHUT = -1, -128
+"""Values of cells while fronts move: not reached yet, and never to be; see `_fronts`."""
+
+PACE = 8  # steps from one look whether anything still moves to the next
+
+
+def _next(now: Array, other: Array) -> Array:
+    """Cells (H + 2, W + 2) after one step; the ring around them is kept from `other`.
+
+    A front's number is that of its label, and all else is negative. So the largest neighbour, and
+    the smallest as unsigned numbers, are the same unless fronts of several labels meet, or none
+    is there; what met gets the sign bit, and passes nothing on. An empty cell that has only shut
+    ones around it becomes one of them: it can never be reached.
+    """
+    north, south, west, east = _beside(now)
+    most = jnp.maximum(jnp.maximum(north, south), jnp.maximum(west, east))
+    north, south, west, east = (lax.bitcast_convert_type(x, jnp.uint8) for x in _beside(now))
+    least = jnp.minimum(jnp.minimum(north, south), jnp.minimum(west, east))
+    differ = lax.bitcast_convert_type(least, jnp.int8) - most  # negative where fronts meet
+    reached = most | (differ & jnp.int8(SHUT))
+    inner = now[1:-1, 1:-1]
+    inner = jnp.where(inner == EMPTY, reached, inner)
+    # Written to the state before `now`, which nobody needs any more, so that nothing is copied.
+    return lax.dynamic_update_slice(other, inner, (1, 1))
+
+
+def _fronts(start: Array, steps: int) -> tuple[Array, Array]:
+    """Move the fronts of one grid (H + 2, W + 2) int8, ringed by shut cells, until nothing moves.
+
+    Returns:
+        The cells: the number of the label that holds it alone, `EMPTY`, or what is shut: closed
+        cells and those in which fronts met. And the number of states from 0 on in which each cell
+        was empty, which is the step of its arrival.
+    """
+    small = np.min_scalar_type(steps + 1)
+    empty = lambda cells: (cells == EMPTY).astype(small)
+
+    def two(now: tuple[Array, Array, Array], _: None):
+        even, odd, waited = now
+        odd = _next(even, odd)
+        even = _next(odd, even)
+        return (even, odd, waited + (empty(odd) + empty(even))), None
+
+    def some(now: tuple[Array, Array, tuple[Array, Array, Array]]):
+        done, _, cells = now
+        cells, _ = lax.scan(two, cells, length=PACE // 2)
+        return done + PACE, jnp.max((cells[0] ^ cells[1]).view(jnp.uint8)) > 0, cells
+
+    whole = steps // PACE * PACE
+    go_on = lambda now: (now[0] < whole) & now[1]
+    begin = (jnp.int32(0), jnp.bool_(True), (start, start, empty(start)))
+    now = lax.while_loop(go_on, some, begin)[2]
+    (even, odd, waited), _ = lax.scan(two, now, length=(steps - whole) // 2)
+    if steps % 2:
+        even = _next(even, odd)
+        waited = waited + empty(even)
+    return even, waited
+
+
+@cache
+def _batched(steps: int) -> Callable[[Array], tuple[Array, Array]]:
+    """`_fronts` that takes the grids of a batch one by one on a CPU: each stays in its cache."""
+    fronts = custom_vmap(partial(_fronts, steps=steps))
+
+    @fronts.def_vmap
+    def _(size: int, batched: list[bool], start: Array):
+        del size, batched
+        one_by_one, together = partial(lax.map, fronts), jax.vmap(partial(_fronts, steps=steps))
+        return lax.platform_dependent(start, cpu=one_by_one, default=together), (True, True)
+
+    return fronts
+
+
 @partial(jax.jit, static_argnames="steps")
 def expand(labels: Array, open: Array, *, steps: int) -> Diagram:
     """Expand all sources together for a fixed number of steps.
 
     Args:
-        labels: (H, W) unsigned bit sets that leave the highest bit free: 7 labels in uint8, 15 in
-            uint16, 31 in uint32; non-zero cells are the sources.
+        labels: (H, W) unsigned bit sets: 8 labels in uint8, 16 in uint16, 32 in uint32; non-zero
+            cells are the sources.
         open: (H, W) bool, the cells that fronts may enter.
         steps: Number of steps; a front advances one cell a step.
+
+    Raises:
+        ValueError: An argument has another shape or type, or `steps` is negative; while tracing.
 
     References:
         Paper, section 2.1, Figs. 1 and 2.
     """
-    # Signed cells carry a mark in the sign bit: what is negative passes nothing on, be it a cell
-    # in which fronts met or a closed one. A ring of closed cells stays around the grid, so that
-    # no step has to pad it.
-    signed = jnp.dtype(f"int{8 * labels.dtype.itemsize}")
-    mark = jnp.iinfo(signed).min
-    cells = lax.bitcast_convert_type(labels, signed)
-    cells = jnp.where(labels & (labels - 1) != 0, cells | mark, cells)
-    cells = jnp.where((cells == 0) & ~open, mark, cells)
-    start = jnp.pad(cells, 1, constant_values=mark)
+    expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
+    expect("open", open, labels.shape, jnp.bool_)
+    if steps < 0:
+        raise ValueError(f"steps is {steps}, not 0 or more")
+    # Fronts move as numbers of one byte instead of sets of bits: a cell's set is known from the
+    # cells around it that were reached before it.
+    number = lax.population_count(labels - 1).astype(jnp.int8)
+    number = jnp.where((labels != 0) & (labels & (labels - 1) == 0), number, SHUT)
+    start = jnp.where((labels == 0) & open, EMPTY, number).astype(jnp.int8)
+    cells, waited = _batched(steps)(jnp.pad(start, 1, constant_values=SHUT))
+    own = waited[1:-1, 1:-1]
+    one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
+    union = labels
+    for front, when in zip(_beside(cells), _beside(waited), strict=True):
+        bit = one << jnp.maximum(front, 0).astype(labels.dtype)
+        union |= jnp.where((front >= 0) & (when < own), bit, none)
+    union = jnp.where(cells[1:-1, 1:-1] == EMPTY, none, union)
+    return Diagram(labels=union, arrival=jnp.where(union != 0, own.astype(jnp.int32), -1))
 
-    def step(now, _):
-        cells, waited = now
-        fronts = jnp.maximum(cells, 0)
-        union = fronts[2:, 1:-1] | fronts[:-2, 1:-1] | fronts[1:-1, 2:] | fronts[1:-1, :-2]
-        met = jnp.where(union & (union - 1) != 0, union | mark, union)
-        inner = cells[1:-1, 1:-1]
-        inner = jnp.where(inner == 0, met, inner)
-        waited = waited + (inner == 0).astype(waited.dtype)
-        return (lax.dynamic_update_slice(cells, inner, (1, 1)), waited), None
 
-    # waited: the steps after which a cell was still empty, so it is reached at waited + 1.
-    (cells, waited), _ = lax.scan(step, (start, jnp.zeros(labels.shape, jnp.int16)), length=steps)
-    cells = lax.bitcast_convert_type(cells[1:-1, 1:-1] & ~mark, labels.dtype)
-    arrival = jnp.where(labels != 0, 0, waited.astype(jnp.int32) + 1)
-    return Diagram(labels=cells, arrival=jnp.where(cells != 0, arrival, -1))
+def _expect_cells(diagram: Diagram, sources: Array) -> None:
+    """Raise ValueError unless a diagram and its sources fit."""
+    expect("diagram.labels", diagram.labels, ("H", "W"), jnp.unsignedinteger)
+    expect("sources", sources, diagram.labels.shape, jnp.bool_)
 
 
 def branches(diagram: Diagram, sources: Array) -> Array:
@@ -91,7 +173,11 @@ def branches(diagram: Diagram, sources: Array) -> Array:
     Args:
         diagram: Result of `expand`.
         sources: (H, W) bool, the cells the fronts came from; they are never branches.
+
+    Raises:
+        ValueError: `sources` has another shape than the diagram, or type; while tracing.
     """
+    _expect_cells(diagram, sources)
     labels = diagram.labels
     met = labels & (labels - 1) != 0
     own = jnp.where(sources, 0, single(labels))
@@ -102,6 +188,15 @@ def branches(diagram: Diagram, sources: Array) -> Array:
 
 
 def junctions(diagram: Diagram, sources: Array) -> Array:
-    """Cells (H, W) bool whose 3 x 3 block, sources left out, holds three or more labels."""
+    """Cells (H, W) bool whose 3 x 3 block, sources left out, holds three or more labels.
+
+    Args:
+        diagram: Result of `expand`.
+        sources: (H, W) bool, the cells the fronts came from.
+
+    Raises:
+        ValueError: `sources` has another shape than the diagram, or type; while tracing.
+    """
+    _expect_cells(diagram, sources)
     union = block_union(jnp.where(sources, 0, diagram.labels))
     return ~sources & (diagram.labels != 0) & (lax.population_count(union) >= 3)

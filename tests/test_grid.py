@@ -1,4 +1,5 @@
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -157,3 +158,23 @@ def test_grids_are_batched():
         alone = rasterise(office_scan(pose), FRONT, SPEC)
         np.testing.assert_array_equal(together.free[k], alone.free)
         np.testing.assert_array_equal(together.occupied[k], alone.occupied)
+
+
+@pytest.mark.parametrize(
+    "call, told",
+    [
+        (
+            lambda s: seen_free(s, FRONT, SPEC),
+            "scan.ranges is float64 (2, 361), not floating (361,)",
+        ),
+        (lambda s: library.rasterise(s, FRONT, SPEC), "scan.hit is bool (2, 361), not bool (361,)"),
+        (
+            lambda s: library.rasterise(Scan(s.ranges[0], s.ranges[0]), FRONT, SPEC),
+            "scan.hit is float64 (361,), not bool (361,)",
+        ),
+    ],
+)
+def test_wrong_shapes_and_types_are_told_while_tracing(call, told):
+    scans = Scan(jnp.zeros((2, 361)), jnp.zeros((2, 361), bool))
+    with pytest.raises(ValueError, match=re.escape(told)):
+        jax.eval_shape(call, scans)

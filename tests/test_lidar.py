@@ -1,4 +1,5 @@
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -69,14 +70,15 @@ def test_nothing_returns_from_beyond_the_reach():
 
 
 def test_bad_readings_become_no_return():
-    lidar = Lidar(reach=5.0)
+    lidar = Lidar(beams=8, reach=5.0)
     scan = limit(jnp.array([1.0, jnp.nan, jnp.inf, -jnp.inf, 0.0, -1.0, 5.0, 7.0]), lidar)
     np.testing.assert_array_equal(scan.hit, [True] + 7 * [False])
     np.testing.assert_array_equal(scan.ranges, [1.0] + 7 * [5.0])
 
 
 def test_noise_has_the_spread_it_says_and_spares_what_was_not_hit():
-    lidar, n = Lidar(noise=0.03), 20_000
+    n = 20_000
+    lidar = Lidar(beams=n, noise=0.03)
     scan = Scan(ranges=jnp.full(n, 2.0).at[:100].set(10.0), hit=jnp.arange(n) >= 100)
     noisy = disturb(jax.random.key(0), scan, lidar)
     error = np.asarray(noisy.ranges - scan.ranges)[100:]
@@ -87,7 +89,8 @@ def test_noise_has_the_spread_it_says_and_spares_what_was_not_hit():
 
 
 def test_readings_pushed_beyond_the_reach_are_lost():
-    lidar, n = Lidar(noise=0.03), 4000
+    n = 4000
+    lidar = Lidar(beams=n, noise=0.03)
     scan = Scan(ranges=jnp.full(n, lidar.reach - 1e-9), hit=jnp.ones(n, bool))
     lost = 1 - np.asarray(disturb(jax.random.key(1), scan, lidar).hit).mean()
     assert abs(lost - 0.5) < 4 * 0.5 / np.sqrt(n)
@@ -101,3 +104,31 @@ def test_scans_are_batched_and_differentiable():
     np.testing.assert_allclose(jax.jit(jax.vmap(ranges))(starts), alone, atol=1e-12)
     slope = jax.jit(jax.jacfwd(ranges))(starts[0])
     assert jnp.isfinite(slope).all()
+
+
+def flat(*shape, dtype=float):
+    return jnp.zeros(shape, dtype)
+
+
+@pytest.mark.parametrize(
+    "call, told",
+    [
+        (lambda: cast(World(flat(5, 3)), flat(3), ROUND), "world.walls is float64 (5, 3)"),
+        (lambda: cast(World(flat(5, 4)), flat(2, 3), ROUND), "pose is float64 (2, 3), not"),
+        (lambda: limit(flat(361), ROUND), "ranges is float64 (361,), not floating (..., 360)"),
+        (lambda: limit(flat(360, dtype=int), ROUND), "ranges is int64 (360,), not floating"),
+        (
+            lambda: points(Scan(flat(2, 360), flat(2, 360)), ROUND),
+            "scan.ranges is float64 (2, 360)",
+        ),
+    ],
+)
+def test_wrong_shapes_and_types_are_told_while_tracing(call, told):
+    with pytest.raises(ValueError, match=re.escape(told)):
+        jax.eval_shape(call)
+
+
+def test_raw_ranges_of_many_scans_are_limited_together():
+    ranges = jnp.array([[1.0, 20.0], [jnp.nan, 2.0]])
+    scans = limit(ranges, Lidar(beams=2))
+    np.testing.assert_array_equal(scans.hit, [[True, False], [False, True]])

@@ -1,3 +1,5 @@
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,7 +7,7 @@ import pytest
 import reference
 from scipy.ndimage import distance_transform_cdt
 
-from jaxslam.voronoi import branches, expand, junctions
+from jaxslam.voronoi import Diagram, branches, expand, junctions
 
 STEPS = 60  # more than any front needs on the grids below
 SEEDS = range(4)
@@ -85,10 +87,10 @@ def test_expand_agrees_with_breadth_first_search(seed, steps):
     assert reference.bits(diagram.labels.max()) > 1 or steps < 5  # fronts did meet
 
 
-@pytest.mark.parametrize("dtype, labels", [(np.uint8, 7), (np.uint16, 15), (np.uint32, 31)])
+@pytest.mark.parametrize("dtype, labels", [(np.uint8, 8), (np.uint16, 16), (np.uint32, 32)])
 def test_every_label_that_fits_expands(dtype, labels):
     bits, open = random_grid(7, dtype=dtype, shape=(30, 30))
-    bits[bits != 0] = 1 << (np.arange(np.count_nonzero(bits)) % labels)
+    bits[bits != 0] = 2 ** (np.arange(np.count_nonzero(bits)) % labels)
     diagram = grown(bits, open)
     assert diagram.labels.dtype == dtype
     assert np.bitwise_or.reduce(diagram.labels, axis=None) == 2**labels - 1
@@ -180,3 +182,72 @@ def test_expand_batches():
     for k in SEEDS:
         alone = grown(bits[k], open[k])
         jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), together, alone)
+
+
+def test_expand_batches_in_two_levels_and_with_one_open_for_all():
+    bits = np.stack([random_grid(seed)[0] for seed in SEEDS])
+    open = random_grid(0)[1]
+    over = lambda b: jax.vmap(lambda one: expand(one, open, steps=STEPS))(b)
+    together = jax.vmap(over)(bits.reshape(2, 2, *open.shape))
+    for k in SEEDS:
+        alone = grown(bits[k], open)
+        for a, b in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(np.asarray(a).reshape(4, *open.shape)[k], b)
+
+
+@pytest.mark.parametrize("steps", [7, 8, 254, 255, 256, 299, 400])
+def test_a_front_may_take_hundreds_of_steps(steps):
+    bits = np.zeros((1, 300), np.uint8)
+    bits[0, 0] = 128
+    diagram = grown(bits, bits == 0, steps=steps)
+    cell = np.arange(300)
+    np.testing.assert_array_equal(diagram.arrival[0], np.where(cell <= steps, cell, -1))
+    np.testing.assert_array_equal(diagram.labels[0], np.where(cell <= steps, 128, 0))
+
+
+def test_a_cell_that_cannot_be_reached_stays_empty():
+    bits = np.zeros((7, 7), np.uint8)
+    bits[0, 0], bits[6, 6] = 1, 2
+    open = np.ones((7, 7), bool)
+    open[2:5, 2:5] = False
+    open[3, 3] = True  # walled in
+    diagram = grown(bits, open)
+    assert diagram.labels[3, 3] == 0 and diagram.arrival[3, 3] == -1
+    np.testing.assert_array_equal(diagram.labels, reference.expand(bits, open, STEPS)[0])
+
+
+def test_a_derivative_passes_the_automaton_by():
+    bits, open = map(jnp.asarray, random_grid(0))
+
+    def length(x):
+        labels = jnp.where(x > 0.0, bits, jnp.zeros_like(bits))
+        return x**2 + jnp.sum(expand(labels, open, steps=STEPS).arrival).astype(x.dtype)
+
+    looped = lambda x: jax.lax.scan(lambda s, _: (jax.checkpoint(length)(s), None), x, length=1)[0]
+    for function in (length, looped, jax.jit(looped)):
+        assert jax.grad(function)(3.0) == 6.0
+
+
+CELLS, MASK = jnp.zeros((4, 5), jnp.uint8), jnp.zeros((4, 5), bool)
+GOOD = Diagram(labels=CELLS, arrival=jnp.zeros((4, 5), jnp.int32))
+
+
+@pytest.mark.parametrize(
+    "call, told",
+    [
+        (lambda: expand(CELLS.astype(int), MASK, steps=1), "labels is int64 (4, 5), not unsigned"),
+        (
+            lambda: expand(CELLS[0], MASK, steps=1),
+            "labels is uint8 (5,), not unsignedinteger (H, W)",
+        ),
+        (lambda: expand(CELLS, MASK[1:], steps=1), "open is bool (3, 5), not bool (4, 5)"),
+        (lambda: expand(CELLS, CELLS, steps=1), "open is uint8 (4, 5), not bool (4, 5)"),
+        (lambda: expand(CELLS, MASK, steps=-1), "steps is -1, not 0 or more"),
+        (lambda: branches(GOOD, MASK[:, 1:]), "sources is bool (4, 4), not bool (4, 5)"),
+        (lambda: junctions(GOOD, CELLS), "sources is uint8 (4, 5), not bool (4, 5)"),
+        (lambda: junctions(Diagram(MASK, MASK), MASK), "diagram.labels is bool (4, 5), not"),
+    ],
+)
+def test_wrong_shapes_and_types_are_told_while_tracing(call, told):
+    with pytest.raises(ValueError, match=re.escape(told)):
+        jax.eval_shape(call)

@@ -1,0 +1,39 @@
+"""Time on one core. Import this before JAX, whose threads stay on the core they start on."""
+
+import gc
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+import jax
+
+
+def seconds(function: Callable, *arguments: Any) -> float:
+    """Seconds of one call, until its result is there."""
+    begin = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - begin
+
+
+def least(calls: Mapping[str, tuple], *, repeats: int, burst: float = 0.02) -> dict[str, float]:
+    """Least seconds of each call, taken in turns so that all see the same machine.
+
+    Args:
+        calls: Function and arguments of each, by name. What they compile is left out.
+        repeats: Rounds.
+        burst: Seconds for which short calls are repeated in each round.
+    """
+    once = {}
+    for name, call in calls.items():
+        seconds(*call)  # compiles
+        once[name] = seconds(*call)
+    gc.collect()
+    for _ in range(repeats):
+        for name, call in calls.items():
+            for _ in range(max(1, min(100, int(burst / once[name])))):
+                once[name] = min(once[name], seconds(*call))
+    return once

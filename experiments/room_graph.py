@@ -13,8 +13,9 @@ from scipy.spatial import Voronoi
 
 from experiments.common import Numbers
 from jaxslam import slam
+from jaxslam.nodes import NodeSpec
 
-CONFIG = slam.Config()
+CONFIG = slam.Config(nodes=NodeSpec(seen=0.5, hidden=0.3))  # ten scans: no junction is to be lost
 NEAR = 0.1  # [m] places this close are one junction
 SPACING = 0.02  # [m] between the points that stand for a wall
 BRANCH = 0.3  # [rad] between the two feet of a branch, at least

@@ -7,11 +7,12 @@ straight wall, found in the order of the beams, with its line fit.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 
+from jaxslam import lines
 from jaxslam.geometry import cross, dot, unit
 from jaxslam.grid import Grid, GridSpec, cell_of, centres
-from jaxslam.lidar import Lidar, Scan, points
+from jaxslam.lidar import Lidar, Scan, bearings, points
+from jaxslam.lines import Moments, Spans
 from jaxslam.types import Array, expect
 from jaxslam.voronoi import around
 
@@ -53,13 +54,14 @@ class Runs(NamedTuple):
     """Straight runs of a scan in the order of its beams (counter-clockwise), padded to K."""
 
     normal: Array  # (K, 2) unit normal, robot frame; the robot is on its positive side
-    centre: Array  # (K, 2) [m] mean of the points of the fit, robot frame
+    centre: Array  # (K, 2) [m] weighted mean of the points, on the line, robot frame
     ends: Array  # (K, 2, 2) [m] first and last end, robot frame
+    end_cov: Array  # (K, 2, 2, 2) [m^2] covariance of the ends
     real: Array  # (K, 2) bool, the wall itself ends there (not the view of it)
-    end_variance: Array  # (K, 2) [m^2] of an end, in any direction
-    variance: Array  # (K,) [m^2] of one point across the line
-    weight: Array  # (K,) number of points in the fit
-    spread: Array  # (K,) [m^2] sum of squared distances of these points from `centre`
+    sharp: Array  # (K, 2) bool, it ends before something further away: what it hides is unseen
+    offset_variance: Array  # (K,) [m^2] of the line across itself, at `centre`
+    angle_variance: Array  # (K,) [rad^2] of its direction
+    count: Array  # (K,) int32 number of beams
     meets: Array  # (K,) bool, this run meets the next one in a corner, at `ends[:, 1]`
     valid: Array  # (K,) bool
     of_beam: Array  # (R,) int32 run of each beam, K for none
@@ -76,16 +78,20 @@ class Runs(NamedTuple):
 
     def line_variance(self, along: Array) -> Array:
         """Variance (..., K) [m^2] across the line, `along` (..., K) [m] from the centre."""
-        return self.variance * (1.0 / self.weight + along**2 / self.spread)
+        return self.offset_variance + along**2 * self.angle_variance
 
 
 class RunSpec(NamedTuple):
     """How scans are cut into runs; static under jit."""
 
     capacity: int = 31  # K, one label bit each, and one for the automaton
+    pieces: int = 56  # stretches before they are merged
     splits: int = 8  # rounds of splitting
+    merges: int = 4  # rounds of merging
     gap: float = 0.2  # [m] a step between beams below this is no jump
     bend: float = 0.06  # [m] a run whose points leave its chord by more is split
+    same: float = 5.0  # standard deviations by which points may leave the line of a merged run
+    rough: float = 0.002  # [m] by which walls themselves leave a line
     corner: float = 0.15  # [m] how far the ends of two runs that meet may be from their corner
 
 
@@ -116,134 +122,83 @@ def jumps(scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
     return broken.at[0].set(True)
 
 
-def _spans(breaks: Array) -> tuple[Array, Array]:
-    """First and last beam (R,) int32 of the stretch each beam is in; True starts a stretch."""
-    beam = jnp.arange(breaks.size, dtype=jnp.int32)
-    first = lax.cummax(jnp.where(breaks, beam, 0))
-    ends = jnp.append(breaks[1:], True)
-    last = lax.cummin(jnp.where(ends, beam, breaks.size - 1), reverse=True)
-    return first, last
+def _fit(xy: Array, weight: Array, of: Array, capacity: int) -> tuple[Array, Moments, Array, Array]:
+    """Normals (K, 2) towards the robot, moments, and sums of squares across and along."""
+    sums = lines.moments(xy, weight, of, lines=capacity)
+    normal, across, along = lines.principal(sums.scatter)
+    normal = jnp.where(dot(normal, sums.mean)[:, None] > 0.0, -normal, normal)
+    return normal, sums, across, along
 
 
-def _split(xy: Array, breaks: Array, tolerance: Array, rounds: int) -> Array:
-    """Break stretches where their points (R, 2) are furthest from their chord, if too far."""
-
-    def step(breaks, _):
-        first, last = _spans(breaks)
-        start, chord = xy[first], xy[last] - xy[first]
-        size = jnp.maximum(jnp.linalg.norm(chord, axis=1), 1e-6)
-        off = jnp.abs(cross(chord, xy - start)) / size
-        # A chord of almost no length says nothing of direction: take the distance to its start.
-        off = jnp.where(size < 0.05, jnp.linalg.norm(xy - start, axis=1), off)
-        # The running maximum of a stretch, in tenths of a millimetre: its first beam in the high
-        # bits makes every stretch begin anew.
-        tenths = jnp.minimum(off * 1e4, 2.0**18 - 1).astype(jnp.int32)
-        running = lax.cummax(first * 2**18 + tenths)
-        worst = running == running[last]
-        leads = worst & ~jnp.roll(worst, 1).at[0].set(False)
-        return breaks | (leads & (off > tolerance)), None
-
-    return lax.scan(step, breaks, length=rounds)[0]
-
-
-def _claim(breaks: Array, hit: Array, capacity: int) -> Array:
-    """Run (R,) int32 of each beam: the stretches with most beams, in the order of the beams.
-
-    Where there are more stretches than runs, the shortest ones share the last run: they are
-    obstacles still, told apart no more.
-    """
-    first, last = _spans(breaks)
-    leads = breaks & hit
-    size = jnp.where(leads, last - first + 1, 0)
-    count = jnp.sum(leads)
-    top, place = lax.top_k(size, capacity)
-    # With overflow the last run is kept free for the rest.
-    kept = jnp.where(count > capacity, jnp.arange(capacity) < capacity - 1, top > 0)
-    order = jnp.sort(jnp.where(kept, place, breaks.size).astype(jnp.int32))
-    slot = jnp.full(breaks.size, capacity - 1, jnp.int32)
-    slot = slot.at[order].set(jnp.arange(capacity, dtype=jnp.int32), mode="drop")
-    return jnp.where(hit, slot[first], capacity)
-
-
-def _fit(xy: Array, member: Array, noise: float) -> tuple[Array, ...]:
-    """Total least squares lines: `member` (K, R) picks the points (R, 2) of each.
-
-    The variance of a point blends the lidar's noise (worth four points) with the residuals.
-    """
-    w = member.astype(xy.dtype)
-    weight = jnp.maximum(w.sum(axis=1), 1.0)
-    centre = (w @ xy) / weight[:, None]
-    d = (xy[None] - centre[:, None]) * w[:, :, None]
-    xx, yy, xy_ = (
-        jnp.sum(d[..., 0] ** 2, 1),
-        jnp.sum(d[..., 1] ** 2, 1),
-        jnp.sum(d[..., 0] * d[..., 1], 1),
-    )
-    flat = (jnp.abs(xy_) < 1e-9) & (jnp.abs(xx - yy) < 1e-9)
-    angle = 0.5 * jnp.arctan2(jnp.where(flat, 0.0, 2 * xy_), jnp.where(flat, 1.0, xx - yy))
-    normal = unit(angle + 0.5 * jnp.pi)
-    normal = jnp.where(dot(normal, centre)[:, None] > 0.0, -normal, normal)
-    half = 0.5 * (xx + yy)
-    tilt = jnp.sqrt(jnp.maximum((0.5 * (xx - yy)) ** 2 + xy_**2, 1e-18))
-    across = jnp.maximum(half - tilt, 0.0)
-    variance = (4 * noise**2 + across) / (4.0 + jnp.maximum(weight - 2.0, 0.0))
-    return normal, centre, variance, weight, jnp.maximum(half + tilt, 1e-6)
-
-
-def _tolerance(lidar: Lidar, spec: RunSpec) -> float:
-    """How far [m] the points of one wall may lie from a line through two of them."""
-    return max(spec.bend, 4.5 * lidar.noise)
-
-
-def _merge(breaks: Array, xy: Array, scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
-    """Undo breaks between stretches of adjacent beams that lie on one line.
-
-    The better line of the two is the judge, at the middle of the other.
-    """
-    of_beam = _claim(breaks, scan.hit, spec.capacity)
-    index = jnp.arange(spec.capacity, dtype=jnp.int32)
-    member = of_beam[None] == index[:, None]
-    normal, centre, _, weight, spread = _fit(xy, member, lidar.noise)
+def _meeting(normal: Array, centre: Array) -> tuple[Array, Array]:
+    """Sine (K,) of the turn from each line to the next, and where they meet (K, 2) [m]."""
     following = lambda x: jnp.roll(x, -1, axis=0)
-    gap = following(centre) - centre
-    by_own, by_next = jnp.abs(dot(gap, normal)), jnp.abs(dot(gap, following(normal)))
-    off = jnp.where(spread >= following(spread), by_own, by_next)
-    same = (weight >= 3) & (following(weight) >= 3) & (off < 0.6 * _tolerance(lidar, spec))
-    same &= (jnp.abs(cross(normal, following(normal))) < 0.2) & (dot(normal, following(normal)) > 0)
-    same &= index < spec.capacity - 2
-    joins = jnp.roll(same, 1).at[0].set(False)
-    # Where the shortest stretches share a run, the next run need not be the next stretch.
-    beside = jnp.roll(of_beam, 1) == of_beam - 1
-    slot = jnp.clip(of_beam, 0, spec.capacity - 1)
-    return breaks & ~(joins[slot] & beside & (of_beam < spec.capacity))
+    turn = cross(normal, following(normal))
+    safe = jnp.where(jnp.abs(turn) > 0.1, turn, 1.0)
+    reach = dot(following(centre) - centre, following(normal)) / safe
+    # The line goes along (ny, -nx), on which the next normal projects to minus the sine.
+    along = jnp.stack([normal[:, 1], -normal[:, 0]], axis=-1)
+    return turn, centre - along * reach[:, None]
+
+
+def _move_ends(spans: Spans, corner: Array, ok: Array, lidar: Lidar) -> Spans:
+    """Stretches that end at the beam of the corner (K, 2) they share with the next, if `ok`."""
+    beam = (jnp.arctan2(corner[:, 1], corner[:, 0]) - lidar.first) / lidar.step
+    beam = jnp.where(beam < -0.5, beam + 2 * jnp.pi / lidar.step, beam)
+    end = jnp.floor(beam).astype(jnp.int32)
+    low = jnp.maximum(spans.first + 1, spans.last - 6)
+    high = jnp.minimum(jnp.roll(spans.last, -1) - 2, spans.last + 6)
+    ok &= (low <= end) & (end <= high)
+    end = jnp.where(ok, end, spans.last)
+    return Spans(jnp.where(jnp.roll(ok, 1), jnp.roll(end, 1) + 1, spans.first), end)
 
 
 def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     """Straight runs of a scan, in the order of its beams.
 
-    The scan is broken at jumps, split where a stretch bends away from its chord, and stretches
-    that lie on one line are joined again. Lines are fitted to the points away from the ends.
-    Where two runs meet, both end in the intersection of their lines.
+    The scan is broken at jumps, stretches are split where they bend away from their chord, and
+    joined again where one line explains them as well as two. Each point counts by its noise
+    across the line, which is small for grazing beams. Two runs that meet end in the
+    intersection of their lines. Where there are more runs than `capacity`, those with the fewest
+    beams share one label: they are obstacles, told apart no more.
     """
-    xy = points(scan, lidar)
+    xy, capacity = points(scan, lidar), spec.capacity
     jump = jumps(scan, lidar, spec)
-    tolerance = jnp.asarray(_tolerance(lidar, spec), xy.dtype)
-    breaks = _split(xy, jump, tolerance, spec.splits)
-    breaks = _merge(breaks, xy, scan, lidar, spec)
+    noise = max(lidar.noise, 0.005)
+    pieces = lines.stretches(jump, scan.hit, capacity=spec.pieces)
+    pieces = lines.split(pieces, xy, max(spec.bend, 4.5 * noise), rounds=spec.splits)
+    pieces = lines.merge(pieces, xy, jump, spec.same * noise, rounds=spec.merges)
+    spans = lines.longest(pieces, capacity=capacity)
+    overflow = jnp.sum(pieces.size > 0) > capacity
+    rest = jnp.arange(capacity) == jnp.where(overflow, jnp.argmin(spans.size), capacity)
 
-    of_beam = _claim(breaks, scan.hit, spec.capacity)
+    # A first fit gives the directions, by which corners and the weights of points follow.
+    of = spans.of_beam(lidar.beams)
+    normal, sums, _, _ = _fit(xy, jnp.ones_like(scan.ranges), of, capacity)
+    following = jnp.roll(jnp.arange(capacity), -1)
+    beside = (following > 0) & (spans.last + 1 == spans.first[following])
+    beside &= ~jump.at[spans.first[following]].get(mode="fill", fill_value=True)
+    adjoin = beside & ~rest & ~rest[following]
+    adjoin &= (spans.size >= 3) & (spans.size[following] >= 3)
+    turn, corner = _meeting(normal, sums.mean)
+    close = jnp.linalg.norm(corner - xy[jnp.maximum(spans.last, 0)], axis=1) < 0.3
+    spans = _move_ends(spans, corner, adjoin & (jnp.abs(turn) > 0.3) & close, lidar)
+    count, first = spans.size, jnp.minimum(spans.first, lidar.beams - 1)
+    last = jnp.maximum(spans.last, 0)
+    of = spans.of_beam(lidar.beams)
     beam = jnp.arange(lidar.beams, dtype=jnp.int32)
-    member = of_beam[None] == jnp.arange(spec.capacity, dtype=jnp.int32)[:, None]  # (K, R)
-    count = member.sum(axis=1, dtype=jnp.int32)
-    first = jnp.min(jnp.where(member, beam[None], lidar.beams - 1), axis=1)
-    last = jnp.max(jnp.where(member, beam[None], 0), axis=1)
-    # The points next to a corner may belong to the other wall: leave them out of the fit.
-    trim = jnp.where(count >= 8, 2, jnp.where(count >= 6, 1, 0))
-    inner = member & (beam[None] >= (first + trim)[:, None])
-    inner &= beam[None] <= (last - trim)[:, None]
-    normal, centre, variance, weight, spread = _fit(xy, inner, lidar.noise)
-    valid = count > 0
-    fitted = count >= 3
+    trim = jnp.where(count >= 6, 1, 0)
+    mine = lambda x: x.at[of].get(mode="clip")
+    inner = (of < capacity) & (beam >= mine(first + trim)) & (beam <= mine(last - trim))
+    slant = dot(mine(normal), unit(bearings(lidar)).astype(xy.dtype))
+    weight = jnp.where(inner, 1.0 / ((noise * slant) ** 2 + spec.rough**2), 0.0)
+    normal, sums, across, spread = _fit(xy, weight, of, capacity)
+    centre, valid, fitted = sums.mean, (count > 0) & ~rest, (count >= 3) & ~rest
+    # The residuals scale the variances, four of them are taken as expected.
+    degrees = jnp.maximum(count - 2 * trim - 2, 0).astype(xy.dtype)
+    scale = (4.0 + across) / (4.0 + degrees)
+    offset_variance = scale / jnp.maximum(sums.weight, 1e-9)
+    angle_variance = scale / jnp.maximum(spread, 1e-6)
     along = jnp.stack([normal[:, 1], -normal[:, 0]], axis=-1)
 
     def onto(point: Array) -> Array:
@@ -251,24 +206,16 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
         return jnp.where(fitted[:, None], on_line, point)
 
     start, end = onto(xy[first]), onto(xy[last])
-
-    # Corners: where the next run begins at the next beam, no jump between.
-    following = jnp.roll(jnp.arange(spec.capacity), -1)
-    touches = valid & valid[following] & (first[following] == last + 1) & ~jump[first[following]]
-    turn = cross(along, along[following])
-    safe = jnp.where(jnp.abs(turn) > 0.3, turn, 1.0)
-    reach = cross(centre[following] - centre, along[following]) / safe
-    corner = centre + along * reach[:, None]
+    turn, corner = _meeting(normal, centre)
     slack = spec.corner + 2 * lidar.step * jnp.linalg.norm(corner, axis=1)
     close = (jnp.linalg.norm(corner - end, axis=1) < slack) & (
         jnp.linalg.norm(corner - start[following], axis=1) < slack
     )
-    meets = touches & fitted & fitted[following] & (jnp.abs(turn) > 0.3) & close
-    meets &= following > 0
+    meets = adjoin & (jnp.abs(turn) > 0.3) & close
     met = jnp.roll(meets, 1)  # by the run before
 
-    # An end is real at a corner, and on the near side of a jump; there the wall goes on for
-    # about half a beam more than was seen of it.
+    # An end is real where another run begins, and on the near side of a jump; there the wall goes
+    # on for about half a beam more than was seen of it.
     before, after = jnp.maximum(first - 1, 0), jnp.minimum(last + 1, lidar.beams - 1)
 
     def silhouette(own: Array, other: Array) -> Array:
@@ -280,24 +227,42 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
         grazing = jnp.abs(cross(along, point)) / jnp.maximum(away, 1e-6)
         return 0.5 * lidar.step * away / jnp.maximum(grazing, 0.1)
 
-    real = jnp.stack([met | silhouette(first, before), meets | silhouette(last, after)], axis=1)
+    sharp = jnp.stack([silhouette(first, before), silhouette(last, after)], axis=1)
+    real = sharp | jnp.stack([jnp.roll(beside, 1), beside], axis=1)
     room = jnp.stack([unseen(start), unseen(end)], axis=1)
-    further = jnp.where(real & fitted[:, None], room, 0.0)
+    further = jnp.where(sharp & fitted[:, None], room, 0.0)
     start = jnp.where(met[:, None], jnp.roll(corner, 1, 0), start - along * further[:, :1])
     end = jnp.where(meets[:, None], corner, end + along * further[:, 1:])
-    cornered = jnp.stack([met, meets], axis=1)
-    end_variance = 2 * variance[:, None] + jnp.where(cornered, 0.0, room**2 / 3)
+    ends = jnp.stack([start, end], axis=1)
+
+    # Of a corner, the inverse of the matrix of the two normals maps the errors of the lines.
+    own = dot(end - centre, along) ** 2 * angle_variance + offset_variance
+    ahead = dot(end - centre[following], along[following]) ** 2 * angle_variance[following]
+    ahead += offset_variance[following]
+    sine = jnp.where(meets, turn, 1.0)[:, None, None]
+    outer = lambda v: v[..., :, None] * v[..., None, :]
+    of_corner = own[:, None, None] * outer(along[following]) + ahead[:, None, None] * outer(along)
+    of_corner = of_corner / sine**2
+    at = dot(ends - centre[:, None], along[:, None])  # (K, 2)
+    across = offset_variance[:, None] + at**2 * angle_variance[:, None]
+    loose = across[..., None, None] * outer(normal)[:, None]
+    loose += (room**2 / 3 + across)[..., None, None] * outer(along)[:, None]
+    cornered = jnp.stack([met, meets], axis=1)[..., None, None]
+    end_cov = jnp.where(cornered, jnp.stack([jnp.roll(of_corner, 1, 0), of_corner], axis=1), loose)
+    shared = jnp.where(overflow, jnp.argmin(spans.size).astype(jnp.int32), capacity)
+    of_beam = jnp.where(scan.hit & (of == capacity), shared, of)
     return Runs(
         normal=normal,
         centre=centre,
-        ends=jnp.stack([start, end], axis=1),
+        ends=ends,
+        end_cov=end_cov,
         real=real,
-        end_variance=end_variance,
-        variance=variance,
-        weight=weight,
-        spread=spread,
+        sharp=sharp,
+        offset_variance=offset_variance,
+        angle_variance=angle_variance,
+        count=count,
         meets=meets,
-        valid=(count > 0) & (count == last - first + 1),
+        valid=valid,
         of_beam=of_beam,
     )
 
@@ -308,22 +273,18 @@ def run_bits(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int 
     Args:
         scan: The scan the runs are of.
         lidar: The scanner.
-        runs: Its runs; run k starts bit k.
+        runs: Its runs; run k starts bit k; where two share a cell, the later has it.
         spec: The grid to draw on.
         fill: Points drawn from each hit to the next of the same run.
     """
     xy, of = points(scan, lidar), runs.of_beam
     capacity = runs.valid.size
     last = jnp.arange(of.size, dtype=jnp.int32) == of.size - 1
-    same = (of == jnp.roll(of, -1)) & (of < capacity - 1) & ~last
+    same = (of == jnp.roll(of, -1)) & runs.valid[jnp.minimum(of, capacity - 1)] & ~last
     part = jnp.where(same[:, None], jnp.arange(fill, dtype=xy.dtype) / fill, 0.0)
     drawn = xy[:, None] + part[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
     drawn = jnp.where((of < capacity)[:, None, None], drawn, jnp.inf)
     index = cell_of(drawn.reshape(-1, 2), spec)
-    slot = jnp.repeat(of, fill)
-    lowest = jnp.full(spec.shape, capacity, jnp.int32)
-    lowest = lowest.at[index[:, 0], index[:, 1]].min(slot, mode="drop")
-    highest = jnp.full(spec.shape, -1, jnp.int32)
-    highest = highest.at[index[:, 0], index[:, 1]].max(slot, mode="drop")
-    bit = lambda k: jnp.uint32(1) << jnp.clip(k, 0, capacity - 1).astype(jnp.uint32)
-    return jnp.where(highest >= 0, bit(lowest) | bit(highest), jnp.uint32(0))
+    run = jnp.full(spec.shape, -1, jnp.int32)
+    run = run.at[index[:, 0], index[:, 1]].max(jnp.repeat(of, fill), mode="drop")
+    return jnp.where(run >= 0, jnp.uint32(1) << jnp.maximum(run, 0).astype(jnp.uint32), 0)

@@ -22,23 +22,28 @@ class Nodes(NamedTuple):
     shape: Array  # (M,) node: clearance [m]; corner: angle of its free side [rad]; wall: 0
     degree: Array  # (M,) int32 number of walls the circle of a node touches
     certified: Array  # (M,) bool, nothing unseen inside the circle of a node
+    trusted: Array  # (M,) bool, worth a new landmark; the others may be matched with known ones
     valid: Array  # (M,) bool, False marks padding
 
 
 class NodeSpec(NamedTuple):
     """How many landmarks a scan may have, and what makes them; static under jit."""
 
-    nodes: int = 6
-    corners: int = 6
+    nodes: int = 8
+    corners: int = 8
     walls: int = 3
-    candidates: int = 24  # junction cells looked at
+    candidates: int = 40  # junction cells looked at
     least: float = 0.35  # [m] smallest clearance of a node
     most: float = 3.2  # [m] largest
-    apart: float = 0.7  # [rad] three feet of a node must differ by this, seen from it
+    distinct: float = 0.15  # [m] nodes nearer to each other than this are one
+    apart: float = 0.75  # [rad] three feet of a trusted node differ by this, seen from it
+    seen: float = 0.9  # part of the circle of a trusted node that was seen
+    thick: float = 0.25  # [m] of walls, as far as they may hide themselves
+    hidden: float = 0.02  # [m] by which such may reach into the circle of a trusted node
     wall_length: float = 2.0  # [m] of a run whose direction counts
-    corner_length: float = 0.3  # [m] of the runs of a corner
+    corner_length: float = 0.12  # [m] of the runs of a corner that is trusted
     corner_angle: float = 0.6  # [rad] by which these must turn
-    touch: float = 0.1  # [m] walls this close to the circle of a node touch it
+    touch: float = 3.0  # standard deviations from the circle of a node within which a wall touches
 
     @property
     def size(self) -> int:
@@ -55,22 +60,16 @@ def find_corners(runs: Runs, spec: NodeSpec) -> Nodes:
     along = runs.along
     following = jnp.roll(along, -1, axis=0)
     turn = jnp.arctan2(cross(along, following), dot(along, following))
-    place = runs.ends[:, 1]
-    s = runs.line_variance(dot(place - runs.centre, along))
-    ahead = dot(place - jnp.roll(runs.centre, -1, axis=0), following)
-    t = jnp.roll(runs.variance, -1) * (
-        1.0 / jnp.roll(runs.weight, -1) + ahead**2 / jnp.roll(runs.spread, -1)
-    )
-    # The inverse of the matrix of two unit normals has the other wall's direction as columns.
-    sine = jnp.where(runs.meets, jnp.sin(turn), 1.0)
-    first, second = following / sine[:, None], along / sine[:, None]
-    cov = s[:, None, None] * first[:, :, None] * first[:, None, :]
-    cov += t[:, None, None] * second[:, :, None] * second[:, None, :]
-    enough = (runs.weight >= 5) & (runs.length > spec.corner_length)
-    good = runs.meets & runs.valid & enough & jnp.roll(enough, -1)
+    place, cov = runs.ends[:, 1], runs.end_cov[:, 1]
+    both = lambda x: x & jnp.roll(x, -1)
+    good = runs.meets & runs.valid & both(runs.count >= 3)
     good &= (jnp.abs(turn) > spec.corner_angle) & (jnp.abs(turn) < jnp.pi - spec.corner_angle)
-    size = jnp.where(good, cov[:, 0, 0] + cov[:, 1, 1], jnp.inf)
-    order = jnp.argsort(size, stable=True)[: spec.corners]
+    size = cov[:, 0, 0] + cov[:, 1, 1]
+    good &= size < 0.02
+    trusted = good & both((runs.count >= 5) & (runs.length > spec.corner_length)) & (size < 0.005)
+    order = jnp.argsort(jnp.where(good, size - trusted.astype(size.dtype), jnp.inf), stable=True)[
+        : spec.corners
+    ]
     inward = jnp.arctan2(runs.normal[:, 1], runs.normal[:, 0]) + 0.5 * turn
     zero = jnp.zeros(spec.corners, place.dtype)
     return blank(
@@ -83,7 +82,8 @@ def find_corners(runs: Runs, spec: NodeSpec) -> Nodes:
             shape=(jnp.pi - turn)[order],
             degree=jnp.full(spec.corners, 2, jnp.int32),
             certified=jnp.ones(spec.corners, bool),
-            valid=(good & (size < 0.02))[order],
+            trusted=trusted[order],
+            valid=good[order],
         )
     )
 
@@ -94,8 +94,8 @@ def find_walls(runs: Runs, spec: NodeSpec) -> Nodes:
     No two directions need be at right angles: each is a landmark of its own.
     """
     angle = jnp.arctan2(runs.along[:, 1], runs.along[:, 0])
-    long = runs.valid & (runs.length > spec.wall_length) & (runs.weight >= 8)
-    precision = runs.spread / runs.variance
+    long = runs.valid & (runs.length > spec.wall_length) & (runs.count >= 8)
+    precision = 1.0 / runs.angle_variance
     length = jnp.where(long, runs.length, 0.0)
 
     def step(left, _):
@@ -118,6 +118,7 @@ def find_walls(runs: Runs, spec: NodeSpec) -> Nodes:
             shape=jnp.zeros(spec.walls, angle.dtype),
             degree=jnp.zeros(spec.walls, jnp.int32),
             certified=jnp.ones(spec.walls, bool),
+            trusted=valid,
             valid=valid,
         )
     )

@@ -117,10 +117,14 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
         labels = edges.run_bits(scan, lidar, runs, spec)
         open = seen_free(scan, lidar, spec)
         sources = labels != 0
-    diagram = voronoi.expand(labels, open, steps=config.steps)
+    octagon = config.labels == "runs"  # the paper's fronts are diamonds
+    diagram = voronoi.expand(labels, open, steps=config.steps, octagon=octagon)
     cells = voronoi.junctions(diagram, sources)
+    union = None
+    if config.labels == "runs":
+        union = voronoi.block_union(jnp.where(sources, 0, diagram.labels))
     found = nodes.join(
-        junctions.find_junctions(cells, scan, runs, lidar, spec, config.nodes),
+        junctions.find_junctions(cells, union, scan, runs, lidar, spec, config.nodes),
         nodes.find_corners(runs, config.nodes),
         nodes.find_walls(runs, config.nodes),
     )
@@ -158,7 +162,7 @@ def needed(config: Config, kind: Array) -> Array:
 
 
 def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Array) -> Array:
-    """Features (M,) bool that are far from all landmarks of their kind."""
+    """Trusted features (M,) bool that are far from all landmarks of their kind."""
     same = (nodes.kind[:, None] == belief.kind[None]) & (belief.seen > 0)[None]
     place = ekf.to_world(belief.pose, nodes.xy)
     gap = jnp.linalg.norm(place[:, None] - belief.places[None], axis=2)
@@ -168,7 +172,7 @@ def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Ar
     is_wall = (nodes.kind == WALL)[:, None]
     near = jnp.where(is_wall, turn < config.wall_apart, gap < config.apart)
     near |= ~is_wall & (distance < config.far)
-    return nodes.valid & (slot == belief.seen.size) & ~jnp.any(same & near, axis=1)
+    return nodes.trusted & (slot == belief.seen.size) & ~jnp.any(same & near, axis=1)
 
 
 def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[Belief, Info]:

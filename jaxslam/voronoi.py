@@ -7,7 +7,7 @@ cell passes nothing on, which makes the diagonal bisector of the Manhattan dista
 """
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache, partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -41,6 +41,11 @@ def _beside(cells: Array) -> tuple[Array, Array, Array, Array]:
     return cells[2:, 1:-1], cells[:-2, 1:-1], cells[1:-1, 2:], cells[1:-1, :-2]
 
 
+def _across(cells: Array) -> tuple[Array, Array, Array, Array]:
+    """The four diagonal neighbours of the inner cells (H, W) of (H + 2, W + 2)."""
+    return cells[2:, 2:], cells[:-2, 2:], cells[2:, :-2], cells[:-2, :-2]
+
+
 def block_union(labels: Array) -> Array:
     """Union (H, W) of the bit sets in the 3 x 3 block around every cell."""
     p = jnp.pad(labels, 1)
@@ -54,18 +59,20 @@ EMPTY, SHUT = -1, -128
 PACE = 8  # steps from one look whether anything still moves to the next
 
 
-def _next(now: Array, other: Array) -> Array:
+def _next(now: Array, other: Array, *, diagonal: bool, more: bool) -> Array:
     """Cells (H + 2, W + 2) after one step; the ring around them is kept from `other`.
 
     A front's number is that of its label, and all else is negative. So the largest neighbour, and
     the smallest as unsigned numbers, are the same unless fronts of several labels meet, or none
     is there; what met gets the sign bit, and passes nothing on. An empty cell that has only shut
-    ones around it becomes one of them: it can never be reached.
+    ones around it becomes one of them: it can never be reached, unless `more` neighbours count in
+    another step.
     """
-    north, south, west, east = _beside(now)
-    most = jnp.maximum(jnp.maximum(north, south), jnp.maximum(west, east))
-    north, south, west, east = (lax.bitcast_convert_type(x, jnp.uint8) for x in _beside(now))
-    least = jnp.minimum(jnp.minimum(north, south), jnp.minimum(west, east))
+    beside = _beside(now) + (_across(now) if diagonal else ())
+    most = reduce(jnp.maximum, beside)
+    least = reduce(jnp.minimum, (lax.bitcast_convert_type(x, jnp.uint8) for x in beside))
+    if more:
+        most = jnp.maximum(most, jnp.int8(EMPTY))
     differ = lax.bitcast_convert_type(least, jnp.int8) - most  # negative where fronts meet
     reached = most | (differ & jnp.int8(SHUT))
     inner = now[1:-1, 1:-1]
@@ -74,7 +81,7 @@ def _next(now: Array, other: Array) -> Array:
     return lax.dynamic_update_slice(other, inner, (1, 1))
 
 
-def _fronts(start: Array, steps: int) -> tuple[Array, Array]:
+def _fronts(start: Array, steps: int, octagon: bool) -> tuple[Array, Array]:
     """Move the fronts of one grid (H + 2, W + 2) int8, ringed by shut cells, until nothing moves.
 
     Returns:
@@ -83,12 +90,14 @@ def _fronts(start: Array, steps: int) -> tuple[Array, Array]:
         was empty, which is the step of its arrival.
     """
     small = np.min_scalar_type(steps + 1)
+    first = partial(_next, diagonal=False, more=octagon)
+    second = partial(_next, diagonal=octagon, more=False)
     empty = lambda cells: (cells == EMPTY).astype(small)
 
     def two(now: tuple[Array, Array, Array], _: None):
         even, odd, waited = now
-        odd = _next(even, odd)
-        even = _next(odd, even)
+        odd = first(even, odd)
+        even = second(odd, even)
         return (even, odd, waited + (empty(odd) + empty(even))), None
 
     def some(now: tuple[Array, Array, tuple[Array, Array, Array]]):
@@ -102,27 +111,28 @@ def _fronts(start: Array, steps: int) -> tuple[Array, Array]:
     now = lax.while_loop(go_on, some, begin)[2]
     (even, odd, waited), _ = lax.scan(two, now, length=(steps - whole) // 2)
     if steps % 2:
-        even = _next(even, odd)
+        even = first(even, odd)
         waited = waited + empty(even)
     return even, waited
 
 
 @cache
-def _batched(steps: int) -> Callable[[Array], tuple[Array, Array]]:
+def _batched(steps: int, octagon: bool) -> Callable[[Array], tuple[Array, Array]]:
     """`_fronts` that takes the grids of a batch one by one on a CPU: each stays in its cache."""
-    fronts = custom_vmap(partial(_fronts, steps=steps))
+    fronts = custom_vmap(partial(_fronts, steps=steps, octagon=octagon))
 
     @fronts.def_vmap
     def _(size: int, batched: list[bool], start: Array):
         del size, batched
-        one_by_one, together = partial(lax.map, fronts), jax.vmap(partial(_fronts, steps=steps))
+        one_by_one = partial(lax.map, fronts)
+        together = jax.vmap(partial(_fronts, steps=steps, octagon=octagon))
         return lax.platform_dependent(start, cpu=one_by_one, default=together), (True, True)
 
     return fronts
 
 
-@partial(jax.jit, static_argnames="steps")
-def expand(labels: Array, open: Array, *, steps: int) -> Diagram:
+@partial(jax.jit, static_argnames=("steps", "octagon"))
+def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> Diagram:
     """Expand all sources together for a fixed number of steps.
 
     Args:
@@ -130,6 +140,8 @@ def expand(labels: Array, open: Array, *, steps: int) -> Diagram:
             cells are the sources.
         open: (H, W) bool, the cells that fronts may enter.
         steps: Number of steps; a front advances one cell a step.
+        octagon: Every second step enters the four diagonal neighbours too. Fronts then grow as
+            octagons, which are nearer to circles than the paper's diamonds.
 
     Raises:
         ValueError: An argument has another shape or type, or `steps` is negative; while tracing.
@@ -146,13 +158,15 @@ def expand(labels: Array, open: Array, *, steps: int) -> Diagram:
     number = lax.population_count(labels - 1).astype(jnp.int8)
     number = jnp.where((labels != 0) & (labels & (labels - 1) == 0), number, SHUT)
     start = jnp.where((labels == 0) & open, EMPTY, number).astype(jnp.int8)
-    cells, waited = _batched(steps)(jnp.pad(start, 1, constant_values=SHUT))
+    cells, waited = _batched(steps, octagon)(jnp.pad(start, 1, constant_values=SHUT))
     own = waited[1:-1, 1:-1]
     one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
     union = labels
-    for front, when in zip(_beside(cells), _beside(waited), strict=True):
+    straight = zip(_beside(cells), _beside(waited), [own >= 0] * 4, strict=True)
+    across = zip(_across(cells), _across(waited), [own % 2 == 0] * 4, strict=True)
+    for front, when, passes in (*straight, *(across if octagon else ())):
         bit = one << jnp.maximum(front, 0).astype(labels.dtype)
-        union |= jnp.where((front >= 0) & (when < own), bit, none)
+        union |= jnp.where((front >= 0) & (when < own) & passes, bit, none)
     union = jnp.where(cells[1:-1, 1:-1] == EMPTY, none, union)
     return Diagram(labels=union, arrival=jnp.where(union != 0, own.astype(jnp.int32), -1))
 
@@ -199,4 +213,5 @@ def junctions(diagram: Diagram, sources: Array) -> Array:
     """
     _expect_cells(diagram, sources)
     union = block_union(jnp.where(sources, 0, diagram.labels))
-    return ~sources & (diagram.labels != 0) & (lax.population_count(union) >= 3)
+    two_less = union & (union - 1)
+    return ~sources & (diagram.labels != 0) & (two_less & (two_less - 1) != 0)

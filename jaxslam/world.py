@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
-from jaxslam.types import Array
+from jaxslam.types import Array, Key
 
 Box = tuple[float, float, float, float]
 """Axis-aligned rectangle x0, y0, x1, y1 [m], with x0 < x1 and y0 < y1."""
@@ -246,3 +247,95 @@ def drive(name: str) -> np.ndarray:
 def places(name: str) -> np.ndarray:
     """Poses (10, 3) from which the world `name` is scanned."""
     return np.array(choose(PLACES, name, "places"))
+
+
+PLAN_WALLS = 160  # S of every random floor plan
+
+
+def _rooms(rng: np.random.Generator, box: Box, thick: float) -> tuple[list[Box], list[Box]]:
+    """Rooms of a box and the doors between them, by cutting it in two again and again."""
+    x0, y0, x1, y1 = box
+    size = np.array([x1 - x0, y1 - y0])
+    axis = int(rng.random() < size[1] / size.sum())  # the longer side is cut more often
+    least = 2.0
+    if size[axis] < 2 * least + thick or size.prod() < rng.uniform(8.0, 22.0):
+        return [box], []
+    cut = rng.uniform(box[axis] + least, box[axis + 2] - least - thick)
+    low, high = list(box), list(box)
+    low[axis + 2], high[axis] = cut, cut + thick
+    parts = [_rooms(rng, tuple(part), thick) for part in (low, high)]
+    rooms, doors = (parts[0][k] + parts[1][k] for k in range(2))
+    # A door where both sides are rooms along its whole width.
+    across = 1 - axis
+    width = rng.uniform(0.85, 1.5)
+    for _ in range(50):
+        start = rng.uniform(box[across] + 0.2, box[across + 2] - 0.2 - width)
+        side = lambda edge, room: np.isclose(room[edge[0]], edge[1])
+        spans = [
+            any(
+                side(edge, room)
+                and room[across] <= start - 0.1
+                and start + width + 0.1 <= room[across + 2]
+                for room in rooms
+            )
+            for edge in ((axis + 2, cut), (axis, cut + thick))
+        ]
+        if all(spans):
+            door = [0.0] * 4
+            door[axis], door[axis + 2] = cut, cut + thick
+            door[across], door[across + 2] = start, start + width
+            return rooms, [*doors, tuple(door)]
+    return rooms, doors
+
+
+def _furniture(rng: np.random.Generator, rooms: list[Box], doors: list[Box]) -> list[np.ndarray]:
+    """Boxes turned at random in some of the rooms, and corners cut off by a slanting wall."""
+    pieces = []
+    for x0, y0, x1, y1 in rooms:
+        kind = rng.random()
+        if kind < 0.45:
+            half = rng.uniform(0.15, 0.4, 2)
+            reach = np.hypot(*half) + 0.75
+            if min(x1 - x0, y1 - y0) > 2 * reach:
+                middle = rng.uniform([x0 + reach, y0 + reach], [x1 - reach, y1 - reach])
+                turn = rng.choice([0.0, rng.uniform(-0.8, 0.8)])
+                c, s = np.cos(turn), np.sin(turn)
+                square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
+                pieces.append(polyline(middle + square @ np.array([[c, s], [-s, c]])))
+        elif kind < 0.75:
+            legs = rng.uniform(0.6, 1.4, 2)
+            x, y = (x0, x1)[int(rng.integers(2))], (y0, y1)[int(rng.integers(2))]
+            a = (x + (legs[0] if x == x0 else -legs[0]), y)
+            b = (x, y + (legs[1] if y == y0 else -legs[1]))
+            low, high = np.minimum(a, b) - 0.1, np.maximum(a, b) + 0.1
+            clear = lambda d, low=low, high=high: (
+                d[2] < low[0] or d[0] > high[0] or d[3] < low[1] or d[1] > high[1]
+            )
+            if all(clear(door) for door in doors):
+                pieces.append(np.array([[*a, *b]]))
+    return pieces
+
+
+def floor_plan(key: Key, *, size: tuple[float, float] = (13.0, 10.0)) -> World:
+    """Random floor plan of rooms joined by doors; boxes and slanting walls stand in some rooms.
+
+    Args:
+        key: Of the random numbers.
+        size: Length and width [m]; from about 5 x 5 m on.
+
+    Returns:
+        `PLAN_WALLS` walls, the last of them without length: padding that nothing sees. The plan
+        is turned by a random angle about its first corner.
+
+    Raises:
+        ValueError: If the plan needs more walls than that.
+    """
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    rooms, doors = _rooms(rng, (0.0, 0.0, *size), 0.15)
+    walls = np.vstack([outline(rooms + doors), *_furniture(rng, rooms, doors)])
+    if len(walls) > PLAN_WALLS:
+        raise ValueError(f"size {size}: {len(walls)} walls, {PLAN_WALLS} at most; ask for less")
+    turn = rng.uniform(-np.pi, np.pi)
+    c, s = np.cos(turn), np.sin(turn)
+    walls = (walls.reshape(-1, 2) @ np.array([[c, s], [-s, c]])).reshape(-1, 4)
+    return World(walls=np.pad(walls, ((0, PLAN_WALLS - len(walls)), (0, 0))))

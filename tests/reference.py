@@ -41,6 +41,20 @@ def expand(labels, open, steps):
     return cells, arrival
 
 
+def expand_octagons(labels, open, steps):
+    """Steps in turn to the four and the eight neighbours, from all cells of one label."""
+    cells = np.array(labels)
+    arrival = np.where(cells != 0, 0, -1)
+    for step in range(1, steps + 1):
+        before = cells.copy()
+        around = block if step % 2 == 0 else neighbours
+        for cell in map(tuple, np.argwhere(open & (before == 0))):
+            near = {int(before[c]) for c in around(cell, cells.shape) if bits(before[c]) == 1}
+            if near:
+                cells[cell], arrival[cell] = sum(near), step
+    return cells, arrival
+
+
 def junctions(cells, sources):
     """Cells whose block holds three labels or more, sources left out."""
     found = np.zeros(cells.shape, bool)

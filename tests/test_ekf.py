@@ -44,6 +44,7 @@ def plain_features(kind, seen):
         shape=zero + 1.0,
         degree=np.zeros(M, np.int32),
         certified=np.zeros(M, bool),
+        trusted=np.zeros(M, bool),
         valid=np.arange(M) < len(kind),
     )
     point = np.diag([RANGE_STD, BEARING_STD]) ** 2 + 1e-4

@@ -7,7 +7,7 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 ORDER = (
-    "types geometry world motion lidar grid voronoi tiles edges global_edges nodes junctions "
+    "types geometry world motion lidar grid voronoi tiles lines edges global_edges nodes junctions "
     "links alignment association ekf ways topomap medial skeleton slam plan metrics "
     "monte_carlo fit io plot report cli"
 ).split()

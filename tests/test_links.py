@@ -189,7 +189,7 @@ def ring(places, valid):
     found = slam.nodes.Nodes(
         *[jnp.zeros(len(places), jnp.int32), places, jnp.zeros((len(places), 2, 2))],
         *[jnp.zeros(len(places)), jnp.zeros(len(places)), jnp.ones(len(places))],
-        *[jnp.full(len(places), 3, jnp.int32), valid, valid],
+        *[jnp.full(len(places), 3, jnp.int32), valid, valid, valid],
     )
     around = lidar.Lidar(beams=721, first=-np.pi)
     scan = lidar.Scan(jnp.full(721, 9.0), jnp.zeros(721, bool))

@@ -36,9 +36,16 @@ def features(walls, pose):
     return found, of(NODE), of(CORNER), of(WALL)
 
 
+def near(place, runs):
+    """Runs (K,) bool about as far from a place as the nearest."""
+    away = junctions.feet(place[0], place[1], junctions.walls_of(runs)).distance
+    return away < jnp.min(away) + 0.5
+
+
 @jax.jit
 def circle(scan, place):
-    return junctions.tangent_circle(place, edges.runs(scan, LIDAR, CONFIG.runs), SPEC)
+    runs = edges.runs(scan, LIDAR, CONFIG.runs)
+    return junctions.tangent_circle(place, near(place, runs), runs, SPEC)
 
 
 def test_the_incircle_of_a_triangle_is_exact_from_any_start():
@@ -136,11 +143,14 @@ def test_gradient_of_a_node_by_the_ranges_equals_finite_differences():
 
 def shifted(runs, draws):
     """Runs whose lines err as their covariance says, by standard normals (2, K)."""
-    tilt = draws[1] * jnp.sqrt(runs.variance / runs.spread)
-    off = draws[0] * jnp.sqrt(runs.variance / runs.weight)
+    tilt = draws[1] * jnp.sqrt(runs.angle_variance)
+    off = draws[0] * jnp.sqrt(runs.offset_variance)
     normal = runs.normal - tilt[:, None] * runs.along
     normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
-    return runs._replace(normal=normal, centre=runs.centre + off[:, None] * runs.normal)
+    at = jnp.sum((runs.ends - runs.centre[:, None]) * runs.along[:, None], axis=2)
+    ends = runs.ends + (off[:, None] + tilt[:, None] * at)[..., None] * runs.normal[:, None]
+    centre = runs.centre + off[:, None] * runs.normal
+    return runs._replace(normal=normal, centre=centre, ends=ends)
 
 
 def test_covariance_of_a_node_is_that_of_its_lines():
@@ -153,7 +163,9 @@ def test_covariance_of_a_node_is_that_of_its_lines():
     @jax.jit
     def centres(scan, draws):
         runs = edges.runs(scan, LIDAR, CONFIG.runs)
-        fit = lambda draw: junctions.tangent_circle(start, shifted(runs, draw), SPEC).centre
+        fit = lambda draw: (
+            junctions.tangent_circle(start, near(start, runs), shifted(runs, draw), SPEC).centre
+        )
         return jax.lax.map(fit, draws)
 
     draws = jax.random.normal(jax.random.key(1), (samples, 2, CONFIG.runs.capacity))
@@ -162,12 +174,8 @@ def test_covariance_of_a_node_is_that_of_its_lines():
     assert np.all(np.abs(sampled - claimed) < 5 * error)
 
 
-def test_covariance_of_a_node_is_that_of_noisy_scans_or_larger():
-    """The model takes a wall's noise for even; grazing beams make less of it, so it is cautious.
-
-    Where a wall is seen at a slant the claimed variance exceeds the sampled one by a factor of one
-    about two; 5 standard errors on either side of that.
-    """
+def test_covariance_of_a_node_is_that_of_noisy_scans():
+    """Each beam counts by its noise across its wall; the lower bound is still the former fit's."""
     samples = 400
     scan, start = scan_of(TRIANGLE, IN_TRIANGLE), to_robot(IN_TRIANGLE, jnp.array(CENTRE))
     one = lambda key: circle(lidar.disturb(key, scan, LIDAR), start)
@@ -201,3 +209,54 @@ def test_float32_finds_what_float64_finds():
     np.testing.assert_array_equal(single.degree, double.degree)
     for name in ("xy", "direction", "shape"):
         np.testing.assert_allclose(getattr(single, name), getattr(double, name), atol=1e-4)
+
+
+def test_gradient_of_a_node_through_the_front_end_equals_finite_differences():
+    scan = lidar.disturb(jax.random.key(0), scan_of(TRIANGLE, IN_TRIANGLE), LIDAR)
+    place = lambda ranges: slam.front_end(CONFIG, scan._replace(ranges=ranges)).xy[0]
+    value = jax.jit(place)
+    slope = jax.jit(jax.grad(lambda ranges, x: place(ranges) @ x))
+    np.testing.assert_allclose(
+        value(scan.ranges), to_robot(IN_TRIANGLE, jnp.array(CENTRE)), atol=0.02
+    )
+    push = 1e-6 * jax.random.normal(jax.random.key(1), scan.ranges.shape)
+    change = (value(scan.ranges + push) - value(scan.ranges - push)) / 2
+    for x in jnp.eye(2):
+        ours = slope(scan.ranges, x)
+        assert np.isfinite(ours).all() and np.any(ours != 0)
+        np.testing.assert_allclose(ours @ push, change @ x, rtol=1e-2)
+
+
+def test_a_node_is_not_trusted_where_a_wall_may_hide_behind_its_end():
+    """A plate ends 3 cm outside the circle; behind it, on the line of sight, lies the circle."""
+    tip = lambda turn: IN_TRIANGLE[:2] + 0.5 * np.array([np.cos(turn), np.sin(turn)])
+    plate = world.polyline([tip(0.85), tip(1.25)])
+    want = to_robot(IN_TRIANGLE, jnp.array(CENTRE))
+    for walls, hides in ((TRIANGLE, False), (np.vstack([TRIANGLE, plate]), True)):
+        _, node, _, _ = features(walls, IN_TRIANGLE)
+        away = np.linalg.norm(node.xy - np.asarray(want), axis=1)
+        assert away.min() < 0.01
+        assert node.trusted[np.argmin(away)] == (not hides)
+        deep = circle(scan_of(walls, IN_TRIANGLE), want).hidden
+        np.testing.assert_allclose(deep, 0.031 if hides else 0.0, atol=0.01)
+
+
+def test_covariance_of_a_corner_is_that_of_noisy_scans():
+    """5 standard errors on either side."""
+    samples, pose, corner = 400, np.array([0.3, 0.2, 0.1]), jnp.array([4.0, 3.0])
+    scan, want = scan_of(world.outline([BOX]), pose), to_robot(pose, corner)
+
+    def one(key):
+        runs = edges.runs(lidar.disturb(key, scan, LIDAR), LIDAR, CONFIG.runs)
+        found = nodes.find_corners(runs, SPEC)
+        away = jnp.where(found.valid, jnp.linalg.norm(found.xy - want[None], axis=1), jnp.inf)
+        best = jnp.argmin(away)
+        return found.xy[best], found.cov[best], away[best]
+
+    many = jax.jit(lambda keys: jax.lax.map(one, keys))
+    place, cov, away = map(np.asarray, many(jax.random.split(jax.random.key(3), samples)))
+    error, claimed = place - np.asarray(want), cov.mean(axis=0)
+    assert away.max() < 0.1
+    ratio = np.linalg.eigvals(np.linalg.solve(claimed, error.T @ error / samples))
+    np.testing.assert_allclose(ratio, 1.0, atol=5 * np.sqrt(2 / samples))
+    assert np.all(np.abs(error.mean(axis=0)) < 5 * error.std(axis=0) / np.sqrt(samples))

@@ -49,6 +49,7 @@ def sight(rng, pose, *, only=range(8), kinds=KINDS, places=PLACES):
         shape=pad(SHAPE[seen]),
         degree=pad(np.full(len(seen), 3, np.int32)),
         certified=pad(np.ones(len(seen), bool)),
+        trusted=pad(np.ones(len(seen), bool)),
         valid=pad(np.ones(len(seen), bool)),
     )
 

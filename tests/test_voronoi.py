@@ -34,8 +34,9 @@ def random_grid(seed, shape=(20, 27), labels=5, walls=0.15, dtype=np.uint8):
     return bits, random.random(shape) > walls
 
 
-def grown(bits, open, steps=STEPS):
-    return jax.tree.map(np.asarray, expand(jnp.asarray(bits), jnp.asarray(open), steps=steps))
+def grown(bits, open, steps=STEPS, octagon=False):
+    diagram = expand(jnp.asarray(bits), jnp.asarray(open), steps=steps, octagon=octagon)
+    return jax.tree.map(np.asarray, diagram)
 
 
 def permuted(bits, order):
@@ -226,6 +227,38 @@ def test_a_derivative_passes_the_automaton_by():
     looped = lambda x: jax.lax.scan(lambda s, _: (jax.checkpoint(length)(s), None), x, length=1)[0]
     for function in (length, looped, jax.jit(looped)):
         assert jax.grad(function)(3.0) == 6.0
+
+
+@pytest.mark.parametrize("steps", [1, 2, 9, STEPS])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_octagons_agree_with_a_slow_automaton(seed, steps):
+    bits, open = random_grid(seed, walls=0.35)
+    diagram = grown(bits, open, steps, octagon=True)
+    labels, arrival = reference.expand_octagons(bits, open, steps)
+    np.testing.assert_array_equal(diagram.labels, labels)
+    np.testing.assert_array_equal(diagram.arrival, arrival)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("quarters", range(4))
+def test_octagons_turn_and_mirror_with_the_grid(quarters, mirror, seed):
+    turn = lambda x: np.rot90(np.fliplr(x) if mirror else x, quarters)
+    bits, open = random_grid(seed)
+    before = grown(bits, open, octagon=True)
+    after = grown(turn(bits), turn(open), octagon=True)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, turn(b)), after, before)
+
+
+@pytest.mark.parametrize("steps", [6, 9])
+def test_one_source_grows_as_an_octagon(steps):
+    """Of n steps, n // 2 go across: |x|, |y| <= n and |x| + |y| <= n + n // 2."""
+    bits = np.zeros((25, 25), np.uint8)
+    bits[12, 12] = 1
+    row, column = np.abs(np.indices(bits.shape) - 12)
+    inside = (np.maximum(row, column) <= steps) & (row + column <= steps + steps // 2)
+    reached = grown(bits, bits == 0, steps, octagon=True).labels != 0
+    np.testing.assert_array_equal(reached, inside)
 
 
 CELLS, MASK = jnp.zeros((4, 5), jnp.uint8), jnp.zeros((4, 5), bool)

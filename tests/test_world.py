@@ -1,6 +1,8 @@
+import jax
 import numpy as np
 import pytest
 
+from experiments import truth
 from jaxslam import world
 from jaxslam.plan import densify
 
@@ -78,3 +80,36 @@ def test_office_drive_is_long_clear_and_passes_places_twice():
     far = np.abs(np.subtract.outer(np.arange(len(path)), np.arange(len(path)))) > 200  # > 10 m
     near = np.linalg.norm(path[:, None] - path, axis=-1) < 0.1
     assert np.any(far & near, axis=1).mean() > 0.05
+
+
+def plan(seed, **options):
+    return world.floor_plan(jax.random.key(seed), **options).walls
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_floor_plan_is_its_keys_alone_and_its_padding_has_no_length(seed):
+    walls = plan(seed)
+    np.testing.assert_array_equal(walls, plan(seed))
+    assert not np.array_equal(walls, plan(seed + 100))
+    assert walls.shape == (world.PLAN_WALLS, 4) and np.isfinite(walls).all()
+    sizes = np.hypot(*(walls[:, 2:] - walls[:, :2]).T)
+    count = len(truth.solid(walls))
+    assert 8 < count < world.PLAN_WALLS
+    assert np.all(sizes[:count] > 1e-3) and not walls[count:].any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_beam_escapes_a_floor_plan(seed):
+    walls = truth.solid(plan(seed))
+    low, high = walls.reshape(-1, 2).min(axis=0), walls.reshape(-1, 2).max(axis=0)
+    places = np.random.default_rng(seed).uniform(low, high, (400, 2))
+    inside = truth.Free(walls).holds(places) & (clearance(places, walls) > 0.1)
+    assert inside.sum() > 50
+    for place in places[inside]:
+        end = truth.hits(place, np.linspace(-np.pi, np.pi, 91), walls)
+        assert np.isfinite(end).all()
+
+
+def test_a_floor_plan_that_needs_too_many_walls_is_refused():
+    with pytest.raises(ValueError, match="size .*60.*ask for less"):
+        plan(0, size=(60.0, 60.0))

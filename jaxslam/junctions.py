@@ -15,7 +15,7 @@ from jax import lax
 from jaxslam.edges import Runs
 from jaxslam.geometry import dot, unit, wrap_angle
 from jaxslam.grid import GridSpec, centre_of, corner
-from jaxslam.lidar import Lidar, Scan, points
+from jaxslam.lidar import Lidar, Scan, before_ends, points
 from jaxslam.nodes import Nodes, NodeSpec, blank
 from jaxslam.types import NODE, Array
 
@@ -163,16 +163,7 @@ def _rim_seen(circle: Circle, scan: Scan, lidar: Lidar) -> Array:
     """
     turn = jnp.linspace(-jnp.pi, jnp.pi, 24, endpoint=False, dtype=scan.ranges.dtype)
     rim = circle.centre[None] + 0.95 * circle.radius * unit(turn)
-    return jnp.all(_seen(rim, scan, lidar))
-
-
-def _seen(places: Array, scan: Scan, lidar: Lidar) -> Array:
-    """Whether places (N, 2) [m] lie before the ends of the beams next to them."""
-    beam = (jnp.arctan2(places[:, 1], places[:, 0]) - lidar.first) / lidar.step
-    low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.beams - 2)
-    within = (beam > -0.5) & (beam < lidar.beams - 0.5)
-    free = jnp.minimum(scan.ranges[low], scan.ranges[low + 1])
-    return within & (jnp.linalg.norm(places, axis=1) < free)
+    return jnp.all(before_ends(rim, scan.ranges, lidar))
 
 
 def find_junctions(
@@ -201,7 +192,7 @@ def find_junctions(
     good &= (circle.radius > spec.least) & (circle.radius < spec.most)
     good &= clearance > circle.radius - spec.touch
     good &= jnp.linalg.norm(circle.centre - place, axis=1) < 0.6
-    good &= (size < 0.04) & _seen(circle.centre, scan, lidar)
+    good &= (size < 0.04) & before_ends(circle.centre, scan.ranges, lidar)
     certified = jax.vmap(_rim_seen, in_axes=(0, None, None))(circle, scan, lidar)
     # Several cells may lead to one circle.
     worth = 1.0 + certified.astype(place.dtype) + 0.1 * circle.radius

@@ -15,7 +15,7 @@ from jax import lax
 from jaxslam.edges import Runs
 from jaxslam.geometry import dot, unit
 from jaxslam.grid import GridSpec, centre_of, corner
-from jaxslam.lidar import Lidar, Scan, points
+from jaxslam.lidar import Lidar, Scan, before_ends, points
 from jaxslam.nodes import Nodes, NodeSpec, blank
 from jaxslam.types import NODE, Array
 
@@ -233,18 +233,9 @@ def _part_seen(circle: Circle, scan: Scan, lidar: Lidar) -> tuple[Array, Array]:
     rings = jnp.array([0.3, 0.6, 0.8, 0.95], turn.dtype)  # their weight is their radius
     offset = circle.radius * rings[:, None, None] * unit(turn)[None]
     places = circle.centre[None] + offset.reshape(-1, 2)
-    seen = _seen(places, scan, lidar).reshape(len(rings), -1)
+    seen = before_ends(places, scan.ranges, lidar).reshape(len(rings), -1)
     area = jnp.sum(seen.mean(axis=1, dtype=rings.dtype) * rings) / jnp.sum(rings)
     return area, jnp.all(seen[-1])
-
-
-def _seen(places: Array, scan: Scan, lidar: Lidar) -> Array:
-    """Whether places (N, 2) [m] lie before the ends of the beams next to them."""
-    beam = (jnp.arctan2(places[:, 1], places[:, 0]) - lidar.first) / lidar.step
-    low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.beams - 2)
-    within = (beam > -0.5) & (beam < lidar.beams - 0.5)
-    free = jnp.minimum(scan.ranges[low], scan.ranges[low + 1])
-    return within & (jnp.linalg.norm(places, axis=1) < free)
 
 
 def find_junctions(
@@ -298,7 +289,7 @@ def find_junctions(
     offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
     clearance = jnp.min(jnp.where(scan.hit, offset, jnp.inf), axis=1)
     good &= clearance > circle.radius - max(0.05, 4 * lidar.noise)
-    good &= _seen(circle.centre, scan, lidar)
+    good &= before_ends(circle.centre, scan.ranges, lidar)
     area, certified = jax.vmap(_part_seen, in_axes=(0, None, None))(circle, scan, lidar)
     trusted = good & (area > spec.seen) & (circle.spread > spec.apart) & (size < 0.005)
     trusted &= (circle.radius > 1.2 * spec.least) & (circle.hidden < spec.hidden)

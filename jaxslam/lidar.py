@@ -45,6 +45,20 @@ def points(scan: Scan, lidar: Lidar) -> Array:
     return scan.ranges[:, None] * unit(bearings(lidar))
 
 
+def before_ends(places: Array, ranges: Array, lidar: Lidar) -> Array:
+    """Whether places (..., 2) [m, robot frame] lie before the ends of both beams beside them.
+
+    Args:
+        places: Where to look.
+        ranges: (R,) [m] how far each beam reaches.
+        lidar: The scanner; what lies outside its field of view does not count as before.
+    """
+    beam = (jnp.arctan2(places[..., 1], places[..., 0]) - lidar.first) / lidar.step
+    low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.beams - 2)
+    within = (beam > -0.5) & (beam < lidar.beams - 0.5)
+    return within & (jnp.linalg.norm(places, axis=-1) < jnp.minimum(ranges[low], ranges[low + 1]))
+
+
 def cast(world: World, pose: Array, lidar: Lidar) -> Scan:
     """Noise-free scan of `world` from `pose` (3,).
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from jaxslam import medial
+from jaxslam import medial, ways
 from jaxslam.topomap import Graph
 from jaxslam.types import NODE
 
@@ -159,12 +159,7 @@ def _trace(cells: np.ndarray, room: np.ndarray) -> _Net:
 def _arc(ends: tuple[int, int], cells: np.ndarray) -> _Arc:
     """Arc along a path of cells."""
     line = _smooth(cells)
-    return _Arc(ends, cells, line, _length(line))
-
-
-def _length(line: np.ndarray) -> float:
-    """Length of a polyline (n, 2)."""
-    return float(np.hypot(*np.diff(line, axis=0).T).sum())
+    return _Arc(ends, cells, line, float(ways.size(line)))
 
 
 def _smooth(cells: np.ndarray) -> np.ndarray:
@@ -176,19 +171,12 @@ def _smooth(cells: np.ndarray) -> np.ndarray:
     kept, todo = {0, len(line) - 1}, [(0, len(line) - 1)]
     while todo:
         a, b = todo.pop()
-        away = _away(line[a + 1 : b], line[a], line[b])
+        away = ways.beside(line[a + 1 : b], line[[a, b]])[0]
         if away.size and away.max() > 0.4:
             worst = a + 1 + int(away.argmax())
             kept.add(worst)
             todo += [(a, worst), (worst, b)]
     return line[sorted(kept)]
-
-
-def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distance (n,) of points (n, 2) to a line segment."""
-    along = end - start
-    part = np.clip((points - start) @ along / max(along @ along, 1e-12), 0.0, 1.0)
-    return np.hypot(*(points - start - part[:, None] * along).T)
 
 
 def _ends(net: _Net) -> dict[int, list[int]]:
@@ -294,7 +282,7 @@ def _graph(net: _Net, space: medial.Places, resolution: float, origin: np.ndarra
         kind=np.full(len(names), NODE),
         clearance=space.room[tuple(cells.T)] * resolution,
         pairs=np.array([[index[own] for own in arc.ends] for arc in arcs], int).reshape(-1, 2),
-        length=np.array([_length(line) for line in lines]),
+        length=np.array([ways.size(line) for line in lines], float),
         arc_clearance=np.array([_narrowest(arc.line, space.foot) for arc in arcs]) * resolution,
         lines=lines,
     )

@@ -16,7 +16,7 @@ from jaxslam import ways
 from jaxslam.association import claim_slots
 from jaxslam.ekf import Belief
 from jaxslam.geometry import to_robot, to_world, unit
-from jaxslam.lidar import Lidar, Scan
+from jaxslam.lidar import Lidar, Scan, before_ends
 from jaxslam.links import LINE, TWIN, Links, gap, repeated
 from jaxslam.types import CORNER, NODE, Array
 from jaxslam.ways import Way
@@ -97,12 +97,8 @@ def _explored(arcs: Arcs, pose: Array, scan: Scan, lidar: Lidar) -> Array:
     rim = ROOM * unit(jnp.linspace(-jnp.pi, jnp.pi, 8, endpoint=False, dtype=pose.dtype))
     places = jnp.concatenate([jnp.zeros_like(rim[:1]), rim])[None] + arcs.line[:, -1:]
     own = to_robot(pose, places)  # (A, 9, 2)
-    beam = (jnp.arctan2(own[..., 1], own[..., 0]) - lidar.first) / lidar.step
-    low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.beams - 2)
-    told = (beam > -0.5) & (beam < lidar.beams - 0.5)
     reach = scan.ranges + jnp.where(scan.hit, SKIN, 0.0).astype(scan.ranges.dtype)
-    told &= jnp.linalg.norm(own, axis=-1) < jnp.minimum(reach[low], reach[low + 1])
-    return jnp.all(told, axis=1) & (arcs.ends[:, 1] < 0)
+    return jnp.all(before_ends(own, reach, lidar), axis=1) & (arcs.ends[:, 1] < 0)
 
 
 def _check(ids: Array, pose: Array, links: Links, scan: Scan, lidar: Lidar) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from jaxslam import world
 from jaxslam.geometry import compose, to_world
-from jaxslam.lidar import Lidar, Scan, bearings, cast, disturb, limit, points
+from jaxslam.lidar import Lidar, Scan, bearings, before_ends, cast, disturb, limit, points
 from jaxslam.world import World
 
 ROUND = Lidar(beams=360, first=-math.pi, step=math.pi / 180)
@@ -132,3 +132,16 @@ def test_raw_ranges_of_many_scans_are_limited_together():
     ranges = jnp.array([[1.0, 20.0], [jnp.nan, 2.0]])
     scans = limit(ranges, Lidar(beams=2))
     np.testing.assert_array_equal(scans.hit, [[True, False], [False, True]])
+
+
+def test_places_lie_before_the_ends_of_both_beams_beside_them():
+    quarter = Lidar(beams=3, first=0.0, step=0.25 * np.pi)
+    ranges = jnp.array([2.0, 2.0, 1.0])
+    angle = jnp.array([0.1, 0.1, 0.9, 0.9, -0.6, 2.2])  # between beams 0 and 1, 1 and 2, outside
+    away = jnp.array([1.9, 2.1, 0.9, 1.1, 0.5, 0.5])
+    places = away[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    want = [True, False, True, False, False, False]
+    np.testing.assert_array_equal(before_ends(places, ranges, quarter), want)
+    np.testing.assert_array_equal(
+        before_ends(places.reshape(2, 3, 2), ranges, quarter), np.reshape(want, (2, 3))
+    )

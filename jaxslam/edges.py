@@ -12,7 +12,7 @@ from jaxslam import lines
 from jaxslam.geometry import cross, dot, unit
 from jaxslam.grid import Grid, GridSpec, cell_of, centres
 from jaxslam.lidar import Lidar, Scan, bearings, points
-from jaxslam.lines import Moments, Spans
+from jaxslam.lines import Moments
 from jaxslam.types import Array, expect
 from jaxslam.voronoi import around
 
@@ -85,12 +85,10 @@ class RunSpec(NamedTuple):
     """How scans are cut into runs; static under jit."""
 
     capacity: int = 31  # K, one label bit each, and one for the automaton
-    pieces: int = 56  # stretches before they are merged
-    splits: int = 8  # rounds of splitting
-    merges: int = 4  # rounds of merging
     gap: float = 0.2  # [m] a step between beams below this is no jump
-    bend: float = 0.06  # [m] a run whose points leave its chord by more is split
-    same: float = 5.0  # standard deviations by which points may leave the line of a merged run
+    price: float = 25.0  # squared standard deviations that a run must explain to be one
+    outlier: float = 16.0  # squared standard deviations that one beam may count
+    lanes: int = 16  # runs that are followed together
     rough: float = 0.002  # [m] by which walls themselves leave a line
     corner: float = 0.15  # [m] how far the ends of two runs that meet may be from their corner
 
@@ -141,48 +139,29 @@ def _meeting(normal: Array, centre: Array) -> tuple[Array, Array]:
     return turn, centre - along * reach[:, None]
 
 
-def _move_ends(spans: Spans, corner: Array, ok: Array, lidar: Lidar) -> Spans:
-    """Stretches that end at the beam of the corner (K, 2) they share with the next, if `ok`."""
-    beam = (jnp.arctan2(corner[:, 1], corner[:, 0]) - lidar.first) / lidar.step
-    beam = jnp.where(beam < -0.5, beam + 2 * jnp.pi / lidar.step, beam)
-    end = jnp.floor(beam).astype(jnp.int32)
-    low = jnp.maximum(spans.first + 1, spans.last - 6)
-    high = jnp.minimum(jnp.roll(spans.last, -1) - 2, spans.last + 6)
-    ok &= (low <= end) & (end <= high)
-    end = jnp.where(ok, end, spans.last)
-    return Spans(jnp.where(jnp.roll(ok, 1), jnp.roll(end, 1) + 1, spans.first), end)
-
-
 def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     """Straight runs of a scan, in the order of its beams.
 
-    The scan is broken at jumps, stretches are split where they bend away from their chord, and
-    joined again where one line explains them as well as two. Each point counts by its noise
-    across the line, which is small for grazing beams. Two runs that meet end in the
+    The scan is broken at jumps, and cut where straight lines explain it best. Each point counts
+    by its noise across the line, which is small for grazing beams. Two runs that meet end in the
     intersection of their lines. Where there are more runs than `capacity`, those with the fewest
     beams share one label: they are obstacles, told apart no more.
     """
     xy, capacity = points(scan, lidar), spec.capacity
     jump = jumps(scan, lidar, spec)
     noise = max(lidar.noise, 0.005)
-    pieces = lines.stretches(jump, scan.hit, capacity=spec.pieces)
-    pieces = lines.split(pieces, xy, max(spec.bend, 4.5 * noise), rounds=spec.splits)
-    pieces = lines.merge(pieces, xy, jump, spec.same * noise, rounds=spec.merges)
-    spans = lines.longest(pieces, capacity=capacity)
-    overflow = jnp.sum(pieces.size > 0) > capacity
+    cut = lines.partition(
+        scan, jump, lidar, noise, price=spec.price, outlier=spec.outlier, lanes=spec.lanes
+    )
+    spans = lines.longest(cut.begins, scan.hit, capacity=capacity)
+    overflow = jnp.sum(cut.begins & scan.hit, dtype=jnp.int32) > capacity
     rest = jnp.arange(capacity) == jnp.where(overflow, jnp.argmin(spans.size), capacity)
 
-    # A first fit gives the directions, by which corners and the weights of points follow.
-    of = spans.of_beam(lidar.beams)
-    normal, sums, _, _ = _fit(xy, jnp.ones_like(scan.ranges), of, capacity)
     following = jnp.roll(jnp.arange(capacity), -1)
     beside = (following > 0) & (spans.last + 1 == spans.first[following])
     beside &= ~jump.at[spans.first[following]].get(mode="fill", fill_value=True)
     adjoin = beside & ~rest & ~rest[following]
     adjoin &= (spans.size >= 3) & (spans.size[following] >= 3)
-    turn, corner = _meeting(normal, sums.mean)
-    close = jnp.linalg.norm(corner - xy[jnp.maximum(spans.last, 0)], axis=1) < 0.3
-    spans = _move_ends(spans, corner, adjoin & (jnp.abs(turn) > 0.3) & close, lidar)
     count, first = spans.size, jnp.minimum(spans.first, lidar.beams - 1)
     last = jnp.maximum(spans.last, 0)
     of = spans.of_beam(lidar.beams)
@@ -190,7 +169,7 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     trim = jnp.where(count >= 6, 1, 0)
     mine = lambda x: x.at[of].get(mode="clip")
     inner = (of < capacity) & (beam >= mine(first + trim)) & (beam <= mine(last - trim))
-    slant = dot(mine(normal), unit(bearings(lidar)).astype(xy.dtype))
+    slant = dot(mine(cut.normal[last]), unit(bearings(lidar)).astype(xy.dtype))
     weight = jnp.where(inner, 1.0 / ((noise * slant) ** 2 + spec.rough**2), 0.0)
     normal, sums, across, spread = _fit(xy, weight, of, capacity)
     centre, valid, fitted = sums.mean, (count > 0) & ~rest, (count >= 3) & ~rest
@@ -208,6 +187,7 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     start, end = onto(xy[first]), onto(xy[last])
     turn, corner = _meeting(normal, centre)
     slack = spec.corner + 2 * lidar.step * jnp.linalg.norm(corner, axis=1)
+    slack += 3 * noise / jnp.maximum(jnp.abs(turn), 0.3)
     close = (jnp.linalg.norm(corner - end, axis=1) < slack) & (
         jnp.linalg.norm(corner - start[following], axis=1) < slack
     )

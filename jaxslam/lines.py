@@ -1,12 +1,14 @@
-"""Stretches of beams that lie on straight lines, and the lines: split, merge and fit."""
+"""Stretches of beams that lie on straight lines, and the lines: cut and fit."""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from jaxslam.geometry import dot, unit
+from jaxslam.lidar import Lidar, Scan, bearings
 from jaxslam.types import Array
 
 NONE = np.iinfo(np.int32).max  # in place of the first beam of padding
@@ -39,76 +41,124 @@ class Moments(NamedTuple):
     scatter: Array  # (K, 3) sum of weighted xx, xy, yy [m^2] about the mean
 
 
-def stretches(breaks: Array, hit: Array, *, capacity: int) -> Spans:
-    """The `capacity` longest stretches of beams that return, cut where `breaks` (R,) bool.
+class Lanes(NamedTuple):
+    """Stretches that may end at the present beam, and their lines; leading axis C.
+
+    In the polar frame turned to its first beam, a line is 1 / r = a cos(turn) + b sin(turn).
+    """
+
+    cost: Array  # (C,) of the best stretches up to the present beam, this one last
+    first: Array  # (C,) int32 first beam
+    heading: tuple[Array, Array]  # (C,), (C,) cosine and sine of its bearing
+    line: tuple[Array, Array]  # (C,), (C,) a and b [1/m]
+    cov: tuple[Array, Array, Array]  # (C,) each, of a and b: aa, ab, bb
+
+
+class Partition(NamedTuple):
+    """The beams of a scan cut into stretches."""
+
+    begins: Array  # (R,) bool, a stretch begins at this beam
+    normal: Array  # (R, 2) unit normal, away from the robot, of the line up to this beam
+
+
+def partition(
+    scan: Scan,
+    breaks: Array,
+    lidar: Lidar,
+    sigma: float,
+    *,
+    price: float,
+    outlier: float,
+    lanes: int,
+    steep: float = 10.0,
+) -> Partition:
+    """Cut a scan into stretches of straight lines: the cut that costs least.
+
+    The cost is the sum of squared residuals of ranges about the line of their stretch, in standard
+    deviations, and a price for each stretch. Beam by beam, every stretch that may still be part of
+    the best cut takes the beam in by one step of recursive least squares: in 1 / r a line is
+    linear. The best cut up to a beam is the best cut up to the beginning of its last stretch, and
+    this; what cannot be better any more makes room for the stretch that begins at the beam.
 
     Args:
-        breaks: A stretch begins at this beam.
-        hit: (R,) bool, the beam returned.
-        capacity: K; the stretches with the fewest beams are left out.
+        scan: The scan.
+        breaks: (R,) bool, a stretch must begin at this beam.
+        lidar: The scanner.
+        sigma: [m] standard deviation of a range.
+        price: Of a stretch.
+        outlier: A beam costs no more than this, and then does not move the line.
+        lanes: C, stretches that are followed together.
+        steep: Tangent of the angle of incidence that is one standard deviation beforehand.
+
+    References:
+        Jackson et al., An algorithm for optimal partitioning of data on an interval, 2005;
+        Killick, Fearnhead, Eckley, Optimal detection of changepoints with a linear computational
+        cost, 2012.
+    """
+    q = 1.0 / jnp.maximum(scan.ranges, 0.02)
+    beam = jnp.arange(lidar.beams, dtype=jnp.int32)
+    ray = unit(bearings(lidar)).astype(q.dtype)
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+
+    def step(now: tuple[Lanes, Array, Array], beam: tuple):
+        old, least, free = now
+        index, q, c, s, alone = beam
+        (hc, hs), (a, b), (aa, ab, bb) = old.heading, old.line, old.cov
+        cosine, sine = c * hc + s * hs, s * hc - c * hs
+        gain_a, gain_b = aa * cosine + ab * sine, ab * cosine + bb * sine
+        off = q - a * cosine - b * sine
+        noise = (sigma * q * q) ** 2
+        total = noise + cosine * gain_a + sine * gain_b
+        excess = off * off / total
+        share = jnp.where(excess < outlier, 1.0 / total, 0.0)
+        cost = jnp.where(alone, jnp.inf, old.cost + jnp.minimum(excess, outlier))
+        line = a + gain_a * share * off, b + gain_b * share * off
+        cov = (
+            aa - gain_a * share * gain_a,
+            ab - gain_a * share * gain_b,
+            bb - gain_b * share * gain_b,
+        )
+        zero = jnp.zeros_like(q)
+        fresh = Lanes(least + price, index, (c, s), (q, zero), (noise, zero, (steep * q) ** 2))
+        goes_on = Lanes(cost, old.first, old.heading, line, cov)
+        new = jax.tree.map(lambda x, y: jnp.where(lane == free, x, y), fresh, goes_on)
+        best, free = jnp.argmin(new.cost), jnp.argmax(new.cost).astype(jnp.int32)
+        (hc, hs), (a, b) = jax.tree.map(lambda x: x[best], (new.heading, new.line))
+        normal = hc * a - hs * b, hs * a + hc * b
+        return (new, new.cost[best], free), (new.first[best], normal)
+
+    zero, one = jnp.zeros(lanes, q.dtype), jnp.ones(lanes, q.dtype)
+    none = Lanes(one * jnp.inf, lane, (one, zero), (zero, zero), (one, zero, one))
+    alone = breaks | ~scan.hit
+    start = none, jnp.zeros((), q.dtype), jnp.int32(0)
+    _, (first, normal) = lax.scan(step, start, (beam, q, ray[:, 0], ray[:, 1], alone))
+
+    def back(last: Array, beam: tuple[Array, Array]):
+        index, before = beam
+        begins = index == last
+        return jnp.where(begins, before, last), begins
+
+    _, begins = lax.scan(back, first[-1], (beam, jnp.roll(first, 1)), reverse=True)
+    normal = jnp.stack(normal, axis=1)
+    size = jnp.sqrt(jnp.maximum(dot(normal, normal), 1e-12))
+    return Partition(begins, normal / size[:, None])
+
+
+def longest(begins: Array, hit: Array, *, capacity: int) -> Spans:
+    """The stretches with most beams, in the order of the beams.
+
+    Args:
+        begins: (R,) bool, a stretch begins at this beam.
+        hit: (R,) bool, the beam returned; stretches of beams that did not are left out.
+        capacity: K.
     """
     beams = hit.size
     beam = jnp.arange(beams, dtype=jnp.int32)
-    ends = hit & jnp.append((breaks | ~hit)[1:], True)
-    first = jnp.sort(jnp.where(breaks & hit, beam, beams))
-    last = jnp.sort(jnp.where(ends, beam, beams))
-    return longest(Spans(first, jnp.where(last < beams, last, -1)), capacity=capacity)
-
-
-def longest(spans: Spans, *, capacity: int) -> Spans:
-    """The stretches with most beams, in the order of the beams."""
-    size, index = lax.top_k(spans.size, capacity)
-    index = jnp.sort(jnp.where(size > 0, index, spans.first.size))
-    return Spans(
-        spans.first.at[index].get(mode="fill", fill_value=NONE),
-        spans.last.at[index].get(mode="fill", fill_value=-1),
-    )
-
-
-def split(spans: Spans, xy: Array, tolerance: float, *, rounds: int) -> Spans:
-    """Cut stretches where their points are furthest from their chord, if too far.
-
-    Args:
-        spans: Stretches; padding is what can be filled with new ones.
-        xy: (R, 2) [m] the points.
-        tolerance: [m] from the chord.
-        rounds: How often every stretch may be cut in two.
-    """
-    beams, capacity = len(xy), spans.first.size
-    bits = int(beams - 1).bit_length()
-    beam = jnp.arange(beams, dtype=jnp.int32)
-    slot = jnp.arange(capacity, dtype=jnp.int32)
-
-    def step(now, _):
-        spans, of = now
-        start = xy[jnp.minimum(spans.first, beams - 1)]
-        chord = xy[jnp.maximum(spans.last, 0)] - start
-        size = jnp.maximum(jnp.sqrt(dot(chord, chord)), 1e-6)
-        normal = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / size[:, None]
-        # A chord of almost no length says nothing of direction: take the distance to its start.
-        short = (size < 0.05)[:, None].astype(xy.dtype)
-        mine = jnp.concatenate([start, normal, short], axis=1).at[of].get(mode="clip")
-        d = xy - mine[:, :2]
-        off = jnp.where(mine[:, 4] > 0.0, jnp.sqrt(dot(d, d)), jnp.abs(dot(mine[:, 2:4], d)))
-        # The furthest beam and its distance in one integer: distances in high bits, 1 mm each.
-        code = jnp.minimum(off * 1e3, 2.0 ** (30 - bits)).astype(jnp.int32) << bits | beam
-        worst = jnp.max(jnp.where(of[None] == slot[:, None], code, 0), axis=1)
-        at = worst & (2**bits - 1)
-        cut = (worst >> bits) > round(tolerance * 1e3)
-        used = jnp.sum(spans.size > 0, dtype=jnp.int32)
-        fresh = used + jnp.sum(cut[None] & (slot[None] < slot[:, None]), axis=1, dtype=jnp.int32)
-        cut &= fresh < capacity
-        into = jnp.where(cut, fresh, capacity)
-        first = spans.first.at[into].set(at, mode="drop")
-        last = spans.last.at[into].set(spans.last, mode="drop")
-        last = jnp.where(cut, at - 1, last)
-        new = jnp.stack([into, at], axis=1).at[of].get(mode="fill", fill_value=capacity)
-        of = jnp.where((new[:, 0] < capacity) & (beam >= new[:, 1]), new[:, 0], of)
-        return (Spans(first, last), of), None
-
-    # Free slots come last.
-    spans = lax.scan(step, (spans, spans.of_beam(beams)), length=rounds)[0][0]
-    return Spans(*lax.sort(tuple(spans), num_keys=1))
+    following = lax.cummin(jnp.where(begins, beam, beams), reverse=True)
+    last = jnp.append(following[1:], beams) - 1
+    size, index = lax.top_k(jnp.where(begins & hit, last - beam + 1, 0), capacity)
+    first = jnp.sort(jnp.where(size > 0, index, NONE))
+    return Spans(first, last.at[first].get(mode="fill", fill_value=-1))
 
 
 def moments(xy: Array, weight: Array, of: Array, *, lines: int) -> Moments:
@@ -124,18 +174,6 @@ def moments(xy: Array, weight: Array, of: Array, *, lines: int) -> Moments:
     return Moments(total, mean, scatter)
 
 
-def joined(a: Moments, b: Moments) -> Moments:
-    """Moments of two sets of points together."""
-    total = jnp.maximum(a.weight + b.weight, 1e-9)
-    gap = b.mean - a.mean
-    outer = jnp.stack([gap[:, 0] ** 2, gap[:, 0] * gap[:, 1], gap[:, 1] ** 2], axis=1)
-    return Moments(
-        a.weight + b.weight,
-        a.mean + gap * (b.weight / total)[:, None],
-        a.scatter + b.scatter + outer * (a.weight * b.weight / total)[:, None],
-    )
-
-
 def principal(scatter: Array) -> tuple[Array, Array, Array]:
     """Normal (..., 2), sum of squares across (...,) and along (...,) of scatters (..., 3)."""
     xx, xy, yy = scatter[..., 0], scatter[..., 1], scatter[..., 2]
@@ -144,48 +182,3 @@ def principal(scatter: Array) -> tuple[Array, Array, Array]:
     angle = 0.5 * jnp.arctan2(jnp.where(flat, 0.0, xy), jnp.where(flat, 1.0, part))
     tilt = jnp.sqrt(jnp.where(flat, 1e-24, part**2 + xy**2))
     return unit(angle + 0.5 * jnp.pi), jnp.maximum(half - tilt, 0.0), half + tilt
-
-
-def merge(spans: Spans, xy: Array, apart: Array, tolerance: float, *, rounds: int) -> Spans:
-    """Join neighbours whose points lie on one line as well as on two.
-
-    Two stretches are joined if the sum of squares across their lines grows by less than the
-    square of the tolerance, those that fit best first.
-
-    Args:
-        spans: Stretches in the order of the beams.
-        xy: (R, 2) [m] the points.
-        apart: (R,) bool, the stretch that begins at this beam is not to be joined to the left.
-        tolerance: [m] of one point; n points may be off by its n^.5 th part.
-        rounds: How often pairs are joined.
-    """
-    beams, capacity = len(xy), spans.first.size
-    slot = jnp.arange(capacity, dtype=jnp.int32)
-    beside = spans.last + 1 == jnp.roll(spans.first, -1)
-    beside &= ~apart.at[jnp.roll(spans.first, -1)].get(mode="fill", fill_value=True)
-    beside &= slot < capacity - 1
-    sums = moments(xy, jnp.ones_like(xy[:, 0]), spans.of_beam(beams), lines=capacity)
-
-    def step(now, _):
-        last, sums, after, before, open = now
-        take = lambda index: Moments(*(x[index] for x in sums))
-        both = joined(sums, take(after))
-        across = principal(sums.scatter)[1]
-        cost = principal(both.scatter)[1] - across - across[after]
-        cost = jnp.where(open, cost, jnp.inf)
-        best = (cost < cost[after]) & (cost <= jnp.where(before == slot, jnp.inf, cost[before]))
-        join = best & (cost < tolerance**2)
-        gone = join[before] & (before != slot)
-        pick = lambda new, old: jnp.where(join.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
-        sums = Moments(*(pick(new, old) for new, old in zip(both, sums, strict=True)))
-        last = jnp.where(gone, -1, pick(last[after], last))
-        open = jnp.where(gone, False, pick(open[after], open))
-        after = pick(after[after], after)
-        before = jnp.where(gone[before], before[before], before)
-        return (last, sums, after, before, open), None
-
-    after = jnp.minimum(slot + 1, capacity - 1)
-    before = jnp.maximum(slot - 1, 0)
-    start = (spans.last, sums, after, before, beside)
-    last = lax.scan(step, start, length=rounds)[0][0]
-    return Spans(jnp.where(last >= 0, spans.first, NONE), last)

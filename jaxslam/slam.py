@@ -120,11 +120,8 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
     octagon = config.labels == "runs"  # the paper's fronts are diamonds
     diagram = voronoi.expand(labels, open, steps=config.steps, octagon=octagon)
     cells = voronoi.junctions(diagram, sources)
-    union = None
-    if config.labels == "runs":
-        union = voronoi.block_union(jnp.where(sources, 0, diagram.labels))
     found = nodes.join(
-        junctions.find_junctions(cells, union, scan, runs, lidar, spec, config.nodes),
+        junctions.find_junctions(cells, scan, runs, lidar, spec, config.nodes),
         nodes.find_corners(runs, config.nodes),
         nodes.find_walls(runs, config.nodes),
     )

@@ -14,6 +14,7 @@ from jaxslam.edges import Runs
 from jaxslam.geometry import dot
 from jaxslam.types import Array
 
+APART = 0.95  # cosine between feet; above this they may well be of one corner or wall
 FLOOR = 4e-6  # [m^2] variance that a foot has besides that of its line
 
 
@@ -152,7 +153,7 @@ def touch(x: Array, y: Array, three: Array, walls: Walls, *, swaps: int) -> Touc
         alike = nearest(-jnp.stack(of_inner))
         swap = (jnp.arange(3, dtype=jnp.int32)[:, None] == alike[None]) & (depth > 1e-3)[None]
         most = jnp.maximum(jnp.maximum(like[0], like[1]), like[2])
-        fourth = nearest(jnp.where(most < 0.95, rest, jnp.inf))
+        fourth = nearest(jnp.where(most < APART, rest, jnp.inf))
         between = [ox[i] * ox[j] + oy[i] * oy[j] for i, j in ((0, 1), (1, 2), (2, 0))]
         cosine = jnp.maximum(jnp.maximum(between[0], between[1]), between[2])
         done = Touching(x, y, radius, three, depth, cosine, fourth)
@@ -214,6 +215,8 @@ def fit(start: Touching, runs: Runs, *, within: float, thick: float) -> Circles:
     index = jnp.arange(len(walls.size), dtype=jnp.int32)[:, None]
     variance = _variance(f, walls, runs)
     touched = jnp.abs(f.distance - radius[None]) < within * jnp.sqrt(variance)
+    own = [_cosine(f.toward, k) for k in three]
+    touched &= jnp.maximum(jnp.maximum(own[0], own[1]), own[2]) < APART
     touched |= (index == three[:1]) | (index == three[1:2]) | (index == three[2:])
     touched &= walls.valid
     w = lax.stop_gradient(jnp.where(touched, 1.0 / variance, 0.0))

@@ -43,7 +43,7 @@ class NodeSpec(NamedTuple):
     wall_length: float = 2.0  # [m] of a run whose direction counts
     corner_length: float = 0.12  # [m] of the runs of a corner that is trusted
     corner_angle: float = 0.6  # [rad] by which these must turn
-    touch: float = 3.0  # standard deviations from the circle of a node within which a wall touches
+    touch: float = 1.5  # standard deviations from the circle of a node within which a wall touches
 
     @property
     def size(self) -> int:

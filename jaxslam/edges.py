@@ -86,7 +86,7 @@ class RunSpec(NamedTuple):
 
     capacity: int = 31  # K, one label bit each, and one for the automaton
     gap: float = 0.2  # [m] a step between beams below this is no jump
-    price: float = 25.0  # squared standard deviations that a run must explain to be one
+    price: float = 20.0  # squared standard deviations that a run must explain to be one
     outlier: float = 16.0  # squared standard deviations that one beam may count
     lanes: int = 16  # runs that are followed together
     rough: float = 0.002  # [m] by which walls themselves leave a line
@@ -247,13 +247,13 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     )
 
 
-def run_bits(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int = 6) -> Array:
-    """Label bits (H, W) uint32 of the cells on each run, drawn without gaps from hit to hit.
+def run_cells(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int = 6) -> Array:
+    """Run (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
 
     Args:
         scan: The scan the runs are of.
         lidar: The scanner.
-        runs: Its runs; run k starts bit k; where two share a cell, the later has it.
+        runs: Its runs; where two share a cell, the later has it.
         spec: The grid to draw on.
         fill: Points drawn from each hit to the next of the same run.
     """
@@ -265,6 +265,5 @@ def run_bits(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int 
     drawn = xy[:, None] + part[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
     drawn = jnp.where((of < capacity)[:, None, None], drawn, jnp.inf)
     index = cell_of(drawn.reshape(-1, 2), spec)
-    run = jnp.full(spec.shape, -1, jnp.int32)
-    run = run.at[index[:, 0], index[:, 1]].max(jnp.repeat(of, fill), mode="drop")
-    return jnp.where(run >= 0, jnp.uint32(1) << jnp.maximum(run, 0).astype(jnp.uint32), 0)
+    run = jnp.full(spec.shape, -1, jnp.int8)
+    return run.at[index[:, 0], index[:, 1]].max(jnp.repeat(of, fill).astype(jnp.int8), mode="drop")

@@ -20,32 +20,26 @@ from jaxslam.lidar import Lidar, Scan, before_ends, points
 from jaxslam.nodes import Nodes, NodeSpec, blank
 from jaxslam.types import NODE, Array
 
+BLOCK = 3  # [cells] a square of so many leads to one circle
 
-def _peaks(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
-    """Index (count, 2) of groups of cells (H, W) bool, the nearest to the robot first.
 
-    Of marked cells next to each other the nearest stands for all.
+def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
+    """Index (count, 2) of the marked cells of (H, W) bool that are nearest to the robot.
+
+    One in every block of cells at most. Also whether there is one.
     """
-    h, w = cells.shape
-    away = np.hypot(*((np.indices(spec.shape) + 0.5) * spec.cell + corner(spec)[:, None, None]))
-    by_rank = np.argsort(-away, axis=None, kind="stable")
+    h, w = spec.shape
+    away = np.hypot(*((np.indices((h, w)) + 0.5) * spec.cell + corner(spec)[:, None, None]))
+    nearest_last = np.argsort(-away, axis=None, kind="stable").astype(np.int32)
     rank = np.empty(h * w, np.float32)
-    rank[by_rank] = np.arange(1, h * w + 1)
+    rank[nearest_last] = np.arange(1, h * w + 1)
     key = jnp.where(cells, jnp.asarray(rank.reshape(h, w)), jnp.float32(0.0))
-    p = jnp.pad(key, 1)
-    rows = jnp.maximum(jnp.maximum(p[:-2], p[2:]), p[1:-1])
-    best = jnp.maximum(jnp.maximum(rows[:, :-2], rows[:, 2:]), rows[:, 1:-1])
-    peaks = _halve(jnp.where(key == best, key, 0.0))  # one at most in every 2 x 2
-    top, _ = lax.top_k(peaks.reshape(-1), count)
-    flat = jnp.asarray(by_rank.astype(np.int32))[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
+    key = jnp.pad(key, ((0, -h % BLOCK), (0, -w % BLOCK)))
+    key = jnp.max(key.reshape(key.shape[0] // BLOCK, BLOCK, -1), axis=1)
+    key = jnp.max(key.reshape(len(key), -1, BLOCK), axis=2)
+    top, _ = lax.top_k(key.reshape(-1), count)
+    flat = jnp.asarray(nearest_last)[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
     return jnp.stack([flat // w, flat % w], axis=-1), top > 0.0
-
-
-def _halve(x: Array) -> Array:
-    """Largest value of each 2 x 2 block of (H, W)."""
-    x = jnp.pad(x, ((0, x.shape[0] % 2), (0, x.shape[1] % 2)))
-    x = jnp.maximum(x[::2], x[1::2])
-    return jnp.maximum(x[:, ::2], x[:, 1::2])
 
 
 def _part_seen(centre: Array, radius: Array, scan: Scan, lidar: Lidar) -> tuple[Array, Array]:
@@ -103,7 +97,7 @@ def find_junctions(
         spec: Capacities and limits.
     """
     walls = walls_of(runs)
-    index, found = _peaks(cells, grid, spec.candidates)
+    index, found = _nearest_cells(cells, grid, spec.candidates)
     place = centre_of(index, grid).astype(scan.ranges.dtype)
     x, y = place[:, 0], place[:, 1]
     alike = math.cos(0.7 * spec.apart)

@@ -111,15 +111,18 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
     if config.labels == "codes":
         grid = rasterise(scan, lidar, spec)
         labels = edges.code_bits(edges.codes(grid, spec))
-        open = grid.free
+        start = voronoi.number(labels, grid.free)
         sources = grid.occupied
     else:
-        labels = edges.run_bits(scan, lidar, runs, spec)
-        open = seen_free(scan, lidar, spec)
-        sources = labels != 0
+        run = edges.run_cells(scan, lidar, runs, spec)
+        sources = run >= 0
+        labels = jnp.where(sources, jnp.uint32(1) << jnp.maximum(run, 0).astype(jnp.uint32), 0)
+        shut = jnp.where(seen_free(scan, lidar, spec), voronoi.EMPTY, voronoi.SHUT)
+        start = jnp.where(sources, run, shut.astype(jnp.int8))
     octagon = config.labels == "runs"  # the paper's fronts are diamonds
-    diagram = voronoi.expand(labels, open, steps=config.steps, octagon=octagon)
-    cells = voronoi.junctions(diagram, sources)
+    fronts = voronoi.grow(start, steps=config.steps, octagon=octagon)
+    diagram = voronoi.gather(labels, fronts, octagon=octagon)
+    cells = voronoi.crowded(fronts, sources)
     found = nodes.join(
         junctions.find_junctions(cells, scan, runs, lidar, spec, config.nodes),
         nodes.find_corners(runs, config.nodes),

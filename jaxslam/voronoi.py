@@ -131,6 +131,61 @@ def _batched(steps: int, octagon: bool) -> Callable[[Array], tuple[Array, Array]
     return fronts
 
 
+class Fronts(NamedTuple):
+    """How far fronts of sources with one label each have come."""
+
+    cells: Array  # (H, W) int8 number of the label that holds a cell alone, or EMPTY, or SHUT
+    waited: Array  # (H, W) unsigned, states from 0 on in which it was empty: step of arrival
+
+
+def number(labels: Array, open: Array) -> Array:
+    """Cells (H, W) int8 that fronts start from: numbers of single labels, EMPTY, or SHUT.
+
+    Args:
+        labels: (H, W) unsigned bit sets.
+        open: (H, W) bool, the cells that fronts may enter.
+    """
+    own = lax.population_count(labels - 1).astype(jnp.int8)
+    own = jnp.where((labels != 0) & (labels & (labels - 1) == 0), own, SHUT)
+    return jnp.where((labels == 0) & open, EMPTY, own).astype(jnp.int8)
+
+
+def grow(start: Array, *, steps: int, octagon: bool = False) -> Fronts:
+    """Expand all sources together, as numbers of one byte a cell: `expand` without the sets.
+
+    Args:
+        start: (H, W) int8 as of `number`.
+        steps: Number of steps; a front advances one cell a step.
+        octagon: As of `expand`.
+    """
+    expect("start", start, ("H", "W"), jnp.int8)
+    if steps < 0:
+        raise ValueError(f"steps is {steps}, not 0 or more")
+    cells, waited = _batched(steps, octagon)(jnp.pad(start, 1, constant_values=SHUT))
+    return Fronts(cells[1:-1, 1:-1], waited[1:-1, 1:-1])
+
+
+def gather(labels: Array, fronts: Fronts, *, octagon: bool = False) -> Diagram:
+    """The sets of all cells: that of one in which fronts met is known from those around it.
+
+    Args:
+        labels: (H, W) unsigned bit sets of the sources.
+        fronts: What grew from them.
+        octagon: As it grew.
+    """
+    cells = jnp.pad(fronts.cells, 1, constant_values=SHUT)
+    waited, own = jnp.pad(fronts.waited, 1), fronts.waited
+    one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
+    union = labels
+    straight = zip(_beside(cells), _beside(waited), [own >= 0] * 4, strict=True)
+    across = zip(_across(cells), _across(waited), [own % 2 == 0] * 4, strict=True)
+    for front, when, passes in (*straight, *(across if octagon else ())):
+        bit = one << jnp.maximum(front, 0).astype(labels.dtype)
+        union |= jnp.where((front >= 0) & (when < own) & passes, bit, none)
+    union = jnp.where(fronts.cells == EMPTY, none, union)
+    return Diagram(labels=union, arrival=jnp.where(union != 0, own.astype(jnp.int32), -1))
+
+
 @partial(jax.jit, static_argnames=("steps", "octagon"))
 def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> Diagram:
     """Expand all sources together for a fixed number of steps.
@@ -151,24 +206,28 @@ def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> 
     """
     expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
     expect("open", open, labels.shape, jnp.bool_)
-    if steps < 0:
-        raise ValueError(f"steps is {steps}, not 0 or more")
-    # Fronts move as numbers of one byte instead of sets of bits: a cell's set is known from the
-    # cells around it that were reached before it.
-    number = lax.population_count(labels - 1).astype(jnp.int8)
-    number = jnp.where((labels != 0) & (labels & (labels - 1) == 0), number, SHUT)
-    start = jnp.where((labels == 0) & open, EMPTY, number).astype(jnp.int8)
-    cells, waited = _batched(steps, octagon)(jnp.pad(start, 1, constant_values=SHUT))
-    own = waited[1:-1, 1:-1]
-    one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
-    union = labels
-    straight = zip(_beside(cells), _beside(waited), [own >= 0] * 4, strict=True)
-    across = zip(_across(cells), _across(waited), [own % 2 == 0] * 4, strict=True)
-    for front, when, passes in (*straight, *(across if octagon else ())):
-        bit = one << jnp.maximum(front, 0).astype(labels.dtype)
-        union |= jnp.where((front >= 0) & (when < own) & passes, bit, none)
-    union = jnp.where(cells[1:-1, 1:-1] == EMPTY, none, union)
-    return Diagram(labels=union, arrival=jnp.where(union != 0, own.astype(jnp.int32), -1))
+    fronts = grow(number(labels, open), steps=steps, octagon=octagon)
+    return gather(labels, fronts, octagon=octagon)
+
+
+def crowded(fronts: Fronts, sources: Array) -> Array:
+    """Cells (H, W) bool whose 3 x 3 block, sources left out, holds three or more numbers.
+
+    `junctions` without the sets of the cells in which fronts met.
+
+    Args:
+        fronts: Result of `grow`.
+        sources: (H, W) bool, the cells they came from.
+    """
+    own = jnp.where(sources, jnp.int8(SHUT), fronts.cells)
+    p = jnp.pad(own, 1, constant_values=SHUT)
+    block = (own, *_beside(p), *_across(p))
+    most = reduce(jnp.maximum, block)
+    # As unsigned numbers, what holds no label is larger than what does.
+    least = reduce(jnp.minimum, (lax.bitcast_convert_type(x, jnp.uint8) for x in block))
+    least = lax.bitcast_convert_type(least, jnp.int8)
+    between = reduce(jnp.logical_or, ((x > least) & (x < most) for x in block))
+    return between & (least >= 0) & (fronts.cells != EMPTY) & ~sources
 
 
 def _expect_cells(diagram: Diagram, sources: Array) -> None:

@@ -32,7 +32,7 @@ class NodeSpec(NamedTuple):
     nodes: int = 8
     corners: int = 8
     walls: int = 3
-    candidates: int = 40  # junction cells looked at
+    candidates: int = 24  # junction cells looked at
     least: float = 0.35  # [m] smallest clearance of a node
     most: float = 3.2  # [m] largest
     distinct: float = 0.15  # [m] nodes nearer to each other than this are one

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxslam import lines
-from jaxslam.geometry import cross, dot, unit
+from jaxslam.geometry import dot, unit
 from jaxslam.grid import Grid, GridSpec, cell_of, centres
 from jaxslam.lidar import Lidar, Scan, bearings, points
-from jaxslam.lines import Moments
 from jaxslam.types import Array, expect
 from jaxslam.voronoi import around
 
@@ -102,7 +101,8 @@ def jumps(scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
     """
     r = scan.ranges
     xy = points(scan, lidar)
-    wide = jnp.linalg.norm(xy - jnp.roll(xy, 1, axis=0), axis=1) > spec.gap
+    x, y = xy[:, 0], xy[:, 1]
+    wide = _size(x - jnp.roll(x, 1), y - jnp.roll(y, 1)) > spec.gap
     twice = 2 * jnp.cos(jnp.asarray(lidar.step, r.dtype))
 
     def predicted(near: Array, far: Array) -> Array:
@@ -120,23 +120,21 @@ def jumps(scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
     return broken.at[0].set(True)
 
 
-def _fit(xy: Array, weight: Array, of: Array, capacity: int) -> tuple[Array, Moments, Array, Array]:
-    """Normals (K, 2) towards the robot, moments, and sums of squares across and along."""
-    sums = lines.moments(xy, weight, of, lines=capacity)
-    normal, across, along = lines.principal(sums.scatter)
-    normal = jnp.where(dot(normal, sums.mean)[:, None] > 0.0, -normal, normal)
-    return normal, sums, across, along
+def _size(x: Array, y: Array) -> Array:
+    return jnp.sqrt(jnp.maximum(x * x + y * y, 1e-12))
 
 
-def _meeting(normal: Array, centre: Array) -> tuple[Array, Array]:
-    """Sine (K,) of the turn from each line to the next, and where they meet (K, 2) [m]."""
-    following = lambda x: jnp.roll(x, -1, axis=0)
-    turn = cross(normal, following(normal))
-    safe = jnp.where(jnp.abs(turn) > 0.1, turn, 1.0)
-    reach = dot(following(centre) - centre, following(normal)) / safe
-    # The line goes along (ny, -nx), on which the next normal projects to minus the sine.
-    along = jnp.stack([normal[:, 1], -normal[:, 0]], axis=-1)
-    return turn, centre - along * reach[:, None]
+def _of_beams(scan: Scan, lidar: Lidar, jump: Array, normal: Array) -> Array:
+    """What runs want to know of the beams they end at, (R, 9), so that it is looked up at once.
+
+    x and y of the hit, normal (2), range, and of the beam before and after: range and jump between.
+    """
+    r, jump = scan.ranges, jump.astype(scan.ranges.dtype)
+    before = jnp.stack([jnp.roll(r, 1), jump], axis=1)
+    after = jnp.stack([jnp.roll(r, -1), jnp.append(jump[1:], 1.0)], axis=1)
+    # Nothing is beyond the first and the last beam: a wall does not end there, its view does.
+    before, after = before.at[0].set(0.0), after.at[-1, 0].set(0.0)
+    return jnp.concatenate([points(scan, lidar), normal, r[:, None], before, after], axis=1)
 
 
 def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
@@ -154,96 +152,96 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
         scan, jump, lidar, noise, price=spec.price, outlier=spec.outlier, lanes=spec.lanes
     )
     spans = lines.longest(cut.begins, scan.hit, capacity=capacity)
+    fewest = jnp.argmin(spans.size).astype(jnp.int32)
     overflow = jnp.sum(cut.begins & scan.hit, dtype=jnp.int32) > capacity
-    rest = jnp.arange(capacity) == jnp.where(overflow, jnp.argmin(spans.size), capacity)
+    slot = jnp.arange(capacity, dtype=jnp.int32)
+    own = ~(overflow & (slot == fewest))
+    count, valid, fitted = spans.size, own & (spans.size > 0), own & (spans.size >= 3)
+    first, last = jnp.minimum(spans.first, lidar.beams - 1), jnp.maximum(spans.last, 0)
+    ends = _of_beams(scan, lidar, jump, cut.normal)[jnp.stack([first, last], axis=1)]
 
-    following = jnp.roll(jnp.arange(capacity), -1)
-    beside = (following > 0) & (spans.last + 1 == spans.first[following])
-    beside &= ~jump.at[spans.first[following]].get(mode="fill", fill_value=True)
-    adjoin = beside & ~rest & ~rest[following]
-    adjoin &= (spans.size >= 3) & (spans.size[following] >= 3)
-    count, first = spans.size, jnp.minimum(spans.first, lidar.beams - 1)
-    last = jnp.maximum(spans.last, 0)
     of = spans.of_beam(lidar.beams)
     beam = jnp.arange(lidar.beams, dtype=jnp.int32)
     trim = jnp.where(count >= 6, 1, 0)
     mine = lambda x: x.at[of].get(mode="clip")
-    inner = (of < capacity) & (beam >= mine(first + trim)) & (beam <= mine(last - trim))
-    slant = dot(mine(cut.normal[last]), unit(bearings(lidar)).astype(xy.dtype))
+    inner = mine(jnp.stack([first + trim, last - trim], axis=1))
+    inner = (of < capacity) & (beam >= inner[:, 0]) & (beam <= inner[:, 1])
+    slant = dot(mine(ends[:, 1, 2:4]), unit(bearings(lidar)).astype(xy.dtype))
     weight = jnp.where(inner, 1.0 / ((noise * slant) ** 2 + spec.rough**2), 0.0)
-    normal, sums, across, spread = _fit(xy, weight, of, capacity)
-    centre, valid, fitted = sums.mean, (count > 0) & ~rest, (count >= 3) & ~rest
+    sums = lines.moments(xy, weight, of, lines=capacity)
+    normal, across, spread = lines.principal(sums.scatter)
+    cx, cy = sums.mean[:, 0], sums.mean[:, 1]
+    sign = jnp.where(dot(normal, sums.mean) > 0.0, -1.0, 1.0)
+    nx, ny = sign * normal[:, 0], sign * normal[:, 1]
     # The residuals scale the variances, four of them are taken as expected.
     degrees = jnp.maximum(count - 2 * trim - 2, 0).astype(xy.dtype)
     scale = (4.0 + across) / (4.0 + degrees)
     offset_variance = scale / jnp.maximum(sums.weight, 1e-9)
     angle_variance = scale / jnp.maximum(spread, 1e-6)
-    along = jnp.stack([normal[:, 1], -normal[:, 0]], axis=-1)
 
-    def onto(point: Array) -> Array:
-        on_line = centre + along * dot(along, point - centre)[:, None]
-        return jnp.where(fitted[:, None], on_line, point)
-
-    start, end = onto(xy[first]), onto(xy[last])
-    turn, corner = _meeting(normal, centre)
-    slack = spec.corner + 2 * lidar.step * jnp.linalg.norm(corner, axis=1)
-    slack += 3 * noise / jnp.maximum(jnp.abs(turn), 0.3)
-    close = (jnp.linalg.norm(corner - end, axis=1) < slack) & (
-        jnp.linalg.norm(corner - start[following], axis=1) < slack
-    )
-    meets = adjoin & (jnp.abs(turn) > 0.3) & close
-    met = jnp.roll(meets, 1)  # by the run before
+    # Ends on the line (ny, -nx): of its points, and of the next line, of which it is a turn away.
+    x, y = ends[:, :, 0], ends[:, :, 1]  # (K, 2)
+    part = (x - cx[:, None]) * ny[:, None] - (y - cy[:, None]) * nx[:, None]
+    x = jnp.where(fitted[:, None], cx[:, None] + part * ny[:, None], x)
+    y = jnp.where(fitted[:, None], cy[:, None] - part * nx[:, None], y)
+    of_next = [nx, ny, cx, cy, offset_variance, angle_variance, x[:, 0], y[:, 0]]
+    mx, my, dx, dy, next_offset, next_angle, next_x, next_y = jnp.roll(jnp.stack(of_next), -1, 1)
+    turn = nx * my - ny * mx
+    safe = jnp.where(jnp.abs(turn) > 0.1, turn, 1.0)
+    reach = ((dx - cx) * mx + (dy - cy) * my) / safe
+    corner_x, corner_y = cx - ny * reach, cy + nx * reach
+    slack = spec.corner + 3 * noise / jnp.maximum(jnp.abs(turn), 0.3)
+    slack += 2 * lidar.step * _size(corner_x, corner_y)
+    close = _size(corner_x - x[:, 1], corner_y - y[:, 1]) < slack
+    close &= _size(corner_x - next_x, corner_y - next_y) < slack
+    next_first, next_fitted = jnp.roll(spans.first, -1), jnp.roll(fitted, -1)
+    beside = (slot < capacity - 1) & (spans.last + 1 == next_first) & (ends[:, 1, 8] == 0.0)
+    meets = beside & fitted & next_fitted & (jnp.abs(turn) > 0.3) & close
 
     # An end is real where another run begins, and on the near side of a jump; there the wall goes
     # on for about half a beam more than was seen of it.
-    before, after = jnp.maximum(first - 1, 0), jnp.minimum(last + 1, lidar.beams - 1)
-
-    def silhouette(own: Array, other: Array) -> Array:
-        near = scan.ranges[own] < jnp.minimum(scan.ranges[other], 0.9 * lidar.reach)
-        return (other != own) & near & jump[jnp.maximum(own, other)]
-
-    def unseen(point: Array) -> Array:
-        away = jnp.linalg.norm(point, axis=1)
-        grazing = jnp.abs(cross(along, point)) / jnp.maximum(away, 1e-6)
-        return 0.5 * lidar.step * away / jnp.maximum(grazing, 0.1)
-
-    sharp = jnp.stack([silhouette(first, before), silhouette(last, after)], axis=1)
-    real = sharp | jnp.stack([jnp.roll(beside, 1), beside], axis=1)
-    room = jnp.stack([unseen(start), unseen(end)], axis=1)
-    further = jnp.where(sharp & fitted[:, None], room, 0.0)
-    start = jnp.where(met[:, None], jnp.roll(corner, 1, 0), start - along * further[:, :1])
-    end = jnp.where(meets[:, None], corner, end + along * further[:, 1:])
-    ends = jnp.stack([start, end], axis=1)
+    away = _size(x, y)
+    grazing = jnp.abs(nx[:, None] * x + ny[:, None] * y) / jnp.maximum(away, 1e-6)
+    room = 0.5 * lidar.step * away / jnp.maximum(grazing, 0.1)
+    beyond = jnp.stack([ends[:, 0, 5], ends[:, 1, 7]], axis=1)
+    sharp = jnp.stack([ends[:, 0, 6], ends[:, 1, 8]], axis=1) > 0.0
+    sharp &= ends[:, :, 4] < jnp.minimum(beyond, 0.9 * lidar.reach)
+    further = jnp.where(sharp & fitted[:, None], room, 0.0) * jnp.array([-1.0, 1.0], x.dtype)[None]
+    x, y = x + ny[:, None] * further, y - nx[:, None] * further
 
     # Of a corner, the inverse of the matrix of the two normals maps the errors of the lines.
-    own = dot(end - centre, along) ** 2 * angle_variance + offset_variance
-    ahead = dot(end - centre[following], along[following]) ** 2 * angle_variance[following]
-    ahead += offset_variance[following]
-    sine = jnp.where(meets, turn, 1.0)[:, None, None]
-    outer = lambda v: v[..., :, None] * v[..., None, :]
-    of_corner = own[:, None, None] * outer(along[following]) + ahead[:, None, None] * outer(along)
-    of_corner = of_corner / sine**2
-    at = dot(ends - centre[:, None], along[:, None])  # (K, 2)
-    across = offset_variance[:, None] + at**2 * angle_variance[:, None]
-    loose = across[..., None, None] * outer(normal)[:, None]
-    loose += (room**2 / 3 + across)[..., None, None] * outer(along)[:, None]
-    cornered = jnp.stack([met, meets], axis=1)[..., None, None]
-    end_cov = jnp.where(cornered, jnp.stack([jnp.roll(of_corner, 1, 0), of_corner], axis=1), loose)
-    shared = jnp.where(overflow, jnp.argmin(spans.size).astype(jnp.int32), capacity)
-    of_beam = jnp.where(scan.hit & (of == capacity), shared, of)
+    part = (corner_x - dx) * my - (corner_y - dy) * mx
+    ahead = (part**2 * next_angle + next_offset) / safe**2
+    here = (reach**2 * angle_variance + offset_variance) / safe**2
+    of_corner = [
+        corner_x,
+        corner_y,
+        here * my * my + ahead * ny * ny,
+        -here * my * mx - ahead * ny * nx,
+        here * mx * mx + ahead * nx * nx,
+        meets.astype(x.dtype),
+    ]
+    of_corner = jnp.stack(of_corner)
+    of_corner = jnp.stack([jnp.roll(of_corner, 1, axis=1), of_corner], axis=2)  # (6, K, 2)
+    part = (x - cx[:, None]) * ny[:, None] - (y - cy[:, None]) * nx[:, None]
+    thin = offset_variance[:, None] + part**2 * angle_variance[:, None]
+    long = thin + room**2 / 3
+    u, v = nx[:, None], ny[:, None]
+    of_end = [x, y, thin * u * u + long * v * v, (thin - long) * u * v, thin * v * v + long * u * u]
+    x, y, xx, cov_xy, yy = jnp.where(of_corner[5:] > 0.0, of_corner[:5], jnp.stack(of_end))
     return Runs(
-        normal=normal,
-        centre=centre,
-        ends=ends,
-        end_cov=end_cov,
-        real=real,
+        normal=jnp.stack([nx, ny], axis=1),
+        centre=sums.mean,
+        ends=jnp.stack([x, y], axis=2),
+        end_cov=jnp.stack([xx, cov_xy, cov_xy, yy], axis=2).reshape(capacity, 2, 2, 2),
+        real=sharp | jnp.stack([jnp.roll(beside, 1), beside], axis=1),
         sharp=sharp,
         offset_variance=offset_variance,
         angle_variance=angle_variance,
         count=count,
         meets=meets,
         valid=valid,
-        of_beam=of_beam,
+        of_beam=jnp.where(scan.hit & (of == capacity) & overflow, fewest, of),
     )
 
 

@@ -221,7 +221,10 @@ def fit(start: Touching, runs: Runs, *, within: float, thick: float) -> Circles:
     touched &= walls.valid
     w = lax.stop_gradient(jnp.where(touched, 1.0 / variance, 0.0))
     total = jnp.maximum(jnp.sum(w, axis=0), 1e-9)
-    for _ in range(2):
+
+    def step(now: tuple[Array, Array, Array], _: None):
+        x, y, radius = now
+        f = feet(x, y, walls)
         (tx, ty), off = f.toward, jnp.where(touched, f.distance - radius[None], 0.0)
         mx, my, mo = (jnp.sum(w * v, axis=0) / total for v in (tx, ty, off))
         dx, dy, do = tx - mx[None], ty - my[None], off - mo[None]
@@ -231,15 +234,18 @@ def fit(start: Touching, runs: Runs, *, within: float, thick: float) -> Circles:
         area = jnp.maximum(xx * yy - xy * xy, 1e-6 * (xx * xx + yy * yy) + 1e-9)
         u = jnp.clip((yy * bx - xy * by) / area, -0.3, 0.3)
         v = jnp.clip((xx * by - xy * bx) / area, -0.3, 0.3)
-        x, y, radius = x + u, y + v, radius + mo - mx * u - my * v
-        f = feet(x, y, walls)
-    cov = jnp.stack([jnp.stack([yy, -xy], axis=-1), jnp.stack([-xy, xx], axis=-1)], axis=-1)
+        cov = yy / area, -xy / area, xx / area
+        return (x + u, y + v, radius + mo - mx * u - my * v), cov
+
+    (x, y, radius), cov = lax.scan(step, (x, y, radius), length=2)
+    xx, xy, yy = (c[-1] for c in cov)
+    f = feet(x, y, walls)
     at_end = jnp.where(f.part <= 0.0, runs.real[:, :1], runs.real[:, 1:])
     real = at_end | ((f.part > 0.0) & (f.part < walls.size))
     return Circles(
         centre=jnp.stack([x, y], axis=-1),
         radius=radius,
-        cov=cov / area[:, None, None],
+        cov=jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], axis=-1),
         depth=radius - jnp.min(f.distance, axis=0),
         touched=touched,
         real=jnp.all(real | ~touched, axis=0),

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.circles import Touching, feet, fit, nearest_three, touch, walls_of
+from jaxslam.circles import feet, fit, nearest_three, touch, walls_of
 from jaxslam.edges import Runs
 from jaxslam.geometry import unit
 from jaxslam.grid import GridSpec, centre_of, corner
@@ -101,25 +101,26 @@ def find_junctions(
     place = centre_of(index, grid).astype(scan.ranges.dtype)
     x, y = place[:, 0], place[:, 1]
     alike = math.cos(0.7 * spec.apart)
-    circle = touch(x, y, nearest_three(feet(x, y, walls), alike), walls, swaps=3)
+    three = nearest_three(feet(x, y, walls), alike)
 
-    def worth(circle: Touching, near: Array) -> Array:
-        away = jnp.hypot(circle.x - near[:, 0], circle.y - near[:, 1])
-        good = (circle.depth < 0.05) & (circle.spread > 0.7 * spec.apart) & (away < 1.0)
-        return jnp.where(good, circle.spread, 0.0)
+    def round(start: tuple[Array, Array, Array, Array], _: None):
+        x, y, three, found = start
+        circle = touch(x, y, three, walls, swaps=3)
+        away = jnp.hypot(circle.x - x, circle.y - y)
+        good = found & (circle.depth < 0.05) & (circle.spread > 0.7 * spec.apart) & (away < 1.0)
+        worth = jnp.where(good, circle.spread, 0.0)
+        at = jnp.stack([circle.x, circle.y], axis=1)
+        first, found = _first(worth, at, spec.distinct, spec.nodes)
+        some = jax.tree.map(lambda x: x[..., first], circle)
+        thrice = lambda x: jnp.repeat(x, 3)
+        swapped = jnp.tile(jnp.eye(3, dtype=bool), spec.nodes)  # (3, C)
+        three = jnp.where(swapped, thrice(some.fourth)[None], jnp.repeat(some.three, 3, axis=1))
+        return (thrice(some.x), thrice(some.y), three, thrice(found)), (circle, worth)
 
-    at = lambda circle: jnp.stack([circle.x, circle.y], axis=1)
-    some = jnp.where(found, worth(circle, place), 0.0)
-    first, found = _first(some, at(circle), spec.distinct, spec.nodes)
-    circle = jax.tree.map(lambda x: x[..., first], circle)
-    for_each = jnp.arange(3, dtype=jnp.int32)[:, None, None] == jnp.arange(3)[None, :, None]
-    three = jnp.where(for_each, circle.fourth[None, None], circle.three[None])  # (3, 3, C)
-    three = three.transpose(1, 0, 2).reshape(3, -1)
-    more = touch(jnp.tile(circle.x, 3), jnp.tile(circle.y, 3), three, walls, swaps=1)
-    other = jnp.where(jnp.tile(found, 3), worth(more, jnp.tile(at(circle), (3, 1))), 0.0)
-    both = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-1), circle, more)
-    worths = jnp.concatenate([jnp.where(found, circle.spread, 0.0), other])
-    first, found = _first(worths, at(both), spec.distinct, 2 * spec.nodes)
+    _, (circle, worth) = lax.scan(round, (x, y, three, found), length=2)
+    both = jax.tree.map(lambda x: jnp.concatenate([x[0], x[1]], axis=-1), circle)
+    at = jnp.stack([both.x, both.y], axis=1)
+    first, found = _first(worth.reshape(-1), at, spec.distinct, 2 * spec.nodes)
     both = jax.tree.map(lambda x: x[..., first], both)
 
     circle = fit(both, runs, within=spec.touch, thick=spec.thick)

@@ -32,7 +32,6 @@ class NodeSpec(NamedTuple):
     nodes: int = 8
     corners: int = 8
     walls: int = 3
-    candidates: int = 24  # junction cells looked at
     least: float = 0.35  # [m] smallest clearance of a node
     most: float = 3.2  # [m] largest
     distinct: float = 0.15  # [m] nodes nearer to each other than this are one
@@ -44,6 +43,11 @@ class NodeSpec(NamedTuple):
     corner_length: float = 0.12  # [m] of the runs of a corner that is trusted
     corner_angle: float = 0.6  # [rad] by which these must turn
     touch: float = 1.5  # standard deviations from the circle of a node within which a wall touches
+
+    @property
+    def candidates(self) -> int:
+        """Number of places that are looked at for nodes: for each node three."""
+        return 3 * self.nodes
 
     @property
     def size(self) -> int:

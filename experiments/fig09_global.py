@@ -24,11 +24,13 @@ from jaxslam.geometry import between, to_world
 from jaxslam.grid import centres
 from jaxslam.lidar import cast, disturb
 from jaxslam.motion import Robot, process_noise, wheel_coefficients
+from jaxslam.nodes import NodeSpec
 from jaxslam.types import NODE
 from jaxslam.voronoi import branches
 
 WORLD = "fig07"
-CONFIG = slam.Config(confirm=1, apart=0.15)
+TRUST = NodeSpec(seen=0.5, hidden=0.3)  # no junction of ten scans is to be lost
+CONFIG = slam.Config(confirm=1, apart=0.15, nodes=TRUST)
 NEAR = 0.1  # [m] a node of the map this close to a junction is that junction
 SHIFT = (0.05, 0.05, 0.05)  # [m, m, rad] standard deviation of places that are moved
 

@@ -2,247 +2,275 @@
 
 Two viewpoints at most 1.5 m apart, of any heading, each give the landmarks of one noisy scan. A
 landmark of the first *ought* to be seen from the second if it is visible there: a node if its
-whole circle lies in view, a corner if the corner is in sight and five beams at least fall on
+whole circle lies in view, a corner if it is in sight and five beams, half a degree apart, fall on
 either of its walls. It *repeats* if a landmark of its kind lies within 0.2 m. It is *spurious* if
-the world has no junction (no corner) within 0.15 m.
+the world has no junction (no corner) within 0.15 m. Thinning is what scikit-image and sknw make of
+the same scans, where they are installed; a map of Willow Garage is looked at if it lies beside the
+repository.
 """
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from experiments import common, truth
+from experiments import common, thinning
+from experiments.viewpoints import (
+    Cells,
+    Drawn,
+    Scene,
+    scene,
+    to_world,
+    turned,
+    visible_circles,
+)
 from jaxslam import lidar, slam, world
+from jaxslam.io import occupancy
+from jaxslam.io.errors import InputError
+from jaxslam.lidar import Scan
 from jaxslam.nodes import Nodes
-from jaxslam.slam import map_batches
-from jaxslam.types import CORNER, NODE
-from jaxslam.world import PLAN_WALLS, World
+from jaxslam.types import NODE
 
+SHARED = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+WILLOW = SHARED / "maps" / "willow-full.yaml"  # no part of the project
 NOISES = (0.0, 0.01, 0.03)  # [m] of a range
 APART = 1.5  # [m] between the viewpoints of a pair at most
 MATCH = 0.2  # [m] within which a landmark repeats
 SPURIOUS = 0.15  # [m] from the nearest true one
-BEAMS = 5  # on each wall of a visible corner
-RIM = np.linspace(-np.pi, np.pi, 36, endpoint=False)
+DISTANCES = (0.0, 0.5, 1.0, APART)  # [m] edges of bins
+HEADINGS = (0.0, 60.0, 120.0, 180.0)  # [degrees] likewise
+
+Worlds = dict[str, list[Scene]]
+Seen = dict[str, list[tuple[Scene, Nodes]]]
 
 
-class Scene(NamedTuple):
-    """A world and viewpoints in it."""
+class Case(NamedTuple):
+    """One way to look at all scenes."""
 
-    walls: np.ndarray  # (S, 4), none without length
-    free: truth.Free
-    junctions: truth.Junctions
-    corners: truth.Corners
-    poses: np.ndarray  # (2 N, 3): the first N and the second N are pairs
+    labels: str  # "runs", "codes" or "thinning"
+    noise: float  # [m] of a range
+    skip: int = 1  # every beam of the lidar, or every second
 
-
-def scene(walls: np.ndarray, rng: np.random.Generator, pairs: int, apart: float) -> Scene:
-    """A world with pairs of viewpoints at most `apart` [m] from each other."""
-    walls = truth.solid(walls)
-    free = truth.Free(walls)
-    low, high = walls.reshape(-1, 2).min(axis=0), walls.reshape(-1, 2).max(axis=0)
-
-    def good(places):
-        return free.holds(places) & (truth.clearance(places, walls) > 0.35)
-
-    def draw(propose, count):
-        kept = np.zeros((0, 4))
-        while len(kept) < count:
-            two = propose(8 * count)
-            seen = good(two[:, :2]) & good(two[:, 2:])
-            seen &= truth.in_sight(two[:, :2], two[:, None, 2:], walls)[:, 0]
-            kept = np.vstack([kept, two[seen]])
-        return kept[:count]
-
-    def propose(count):
-        first = rng.uniform(low, high, (count, 2))
-        turn, away = rng.uniform(-np.pi, np.pi, count), apart * np.sqrt(rng.uniform(0, 1, count))
-        step = away[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
-        return np.hstack([first, first + step])
-
-    places = draw(propose, pairs).reshape(pairs, 2, 2).transpose(1, 0, 2).reshape(-1, 2)
-    heading = rng.uniform(-np.pi, np.pi, 2 * pairs)
-    return Scene(
-        walls,
-        free,
-        truth.junctions(walls, free),
-        truth.corners(walls),
-        np.column_stack([places, heading]),
-    )
+    @property
+    def config(self) -> slam.Config:
+        """What the front end is given."""
+        usual = lidar.Lidar()
+        beams, step = (usual.beams - 1) // self.skip + 1, usual.step * self.skip
+        own = usual._replace(noise=self.noise, beams=beams, step=step)
+        labels = slam.Config().labels if self.labels == "thinning" else self.labels
+        return slam.Config(lidar=own, labels=labels)
 
 
-@partial(jax.jit, static_argnames=("config",))
-def features(key, config: slam.Config, walls, poses) -> Nodes:
-    """Landmarks of noisy scans from poses (N, 3)."""
-
-    def one(item):
-        key, pose = item
-        scan = lidar.disturb(key, lidar.cast(World(walls), pose, config.lidar), config.lidar)
-        return slam.front_end(config, scan)
-
-    return map_batches(one, (jax.random.split(key, len(poses)), poses), size=slam.BATCH)
+USUAL, COARSE = Case("runs", 0.01), Case("runs", 0.01, skip=2)
 
 
-def seen_from(key, config: slam.Config, at: Scene) -> Nodes:
-    """Landmarks of a noisy scan from each viewpoint of a scene, as NumPy."""
-    walls = jnp.asarray(np.pad(at.walls, ((0, PLAN_WALLS - len(at.walls)), (0, 0))), float)
-    return jax.tree.map(np.asarray, features(key, config, walls, jnp.asarray(at.poses, float)))
+@partial(jax.jit, static_argnames="config")
+def _features(config: slam.Config, scans: Scan) -> Nodes:
+    return slam.map_batches(partial(slam.front_end, config), scans, size=slam.BATCH)
 
 
-def to_world(poses: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Places (N, M, 2) of the frames of poses (N, 3) in the world."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
-    return np.einsum("nij,nmj->nmi", turn, places) + poses[:, None, :2]
+def look(key, worlds: Worlds, case: Case) -> Seen:
+    """Landmarks of a noisy scan from each viewpoint; the same key means the same noise."""
+    scenes, scanner = [at for scenes in worlds.values() for at in scenes], case.config.lidar
+    ranges = jnp.asarray(np.concatenate([at.ranges[:, :: case.skip] for at in scenes]), float)
+    scans = lidar.disturb(key, lidar.limit(ranges, scanner), scanner)
+    find = thinning.landmarks if case.labels == "thinning" else _features
+    found = jax.tree.map(np.asarray, find(case.config, scans))
+    ends = np.cumsum([len(at.poses) for at in scenes])[:-1]
+    parts = zip(*(np.split(field, ends) for field in found), strict=True)
+    return {name: [(at, Nodes(*next(parts))) for at in scenes] for name, scenes in worlds.items()}
 
 
-def turned(poses: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """Covariances (N, M, 2, 2) of the frames of poses (N, 3) in the world."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
-    return np.einsum("nij,nmjk,nlk->nmil", turn, cov, turn)
-
-
-def in_view(poses: np.ndarray, places: np.ndarray, config: slam.Config) -> np.ndarray:
-    """Whether places (N, K, 2) [m, world] are in the view of poses (N, 3), and on their grid."""
-    offset = places - poses[:, None, :2]
-    bearing = np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, None, 2]
-    bearing = (bearing - config.lidar.first) % (2 * np.pi)
-    away = np.hypot(offset[..., 0], offset[..., 1])
-    reach = min(config.lidar.reach, config.grid.ahead, config.grid.side)
-    return (bearing <= (config.lidar.beams - 1) * config.lidar.step) & (away < reach)
-
-
-def visible_circles(at: Scene, poses, places, radii, config) -> np.ndarray:
-    """Whether circles, centres (N, 2) and radii (N,), are wholly in view of poses (N, 3)."""
-    rim = np.stack([np.cos(RIM), np.sin(RIM)], axis=-1)
-    rim = places[:, None] + 0.95 * radii[:, None, None] * rim
-    seen = in_view(poses, rim, config).all(axis=-1)
-    seen[seen] = truth.in_sight(poses[seen, :2], rim[seen], at.walls).all(axis=-1)
-    return seen
-
-
-def visible_corners(at: Scene, config: slam.Config) -> np.ndarray:
-    """Whether each pose sees each corner, and either wall of it with five beams: (2 N, C) bool."""
-    turn = config.lidar.first + config.lidar.step * np.arange(config.lidar.beams)
-    corner, along = at.corners
-    result = np.zeros((len(at.poses), len(corner)), bool)
-    for n, pose in enumerate(at.poses):
-        near = corner + 1e-6 * (pose[:2] - corner)
-        seen = truth.in_sight(pose[None, :2], near[None], at.walls)
-        seen = np.flatnonzero((seen & in_view(pose[None], near[None], config))[0])
-        ends = truth.hits(pose[:2], pose[2] + turn, at.walls)
-        offset = (ends[:, None] - corner[seen])[:, :, None]  # (R, C, 1, 2)
-        ahead = np.sum(offset * along[seen], axis=-1)
-        across = np.sum(offset * along[seen][..., ::-1] * [1, -1], axis=-1)
-        on = (ahead > 0) & (ahead < 1.0) & (np.abs(across) < 1e-4)
-        result[n, seen] = np.all(on.sum(axis=0) >= BEAMS, axis=-1)
-    return result
-
-
-def judge(config: slam.Config, at: Scene, found: Nodes, kinds=(NODE, CORNER)) -> dict:
-    """Checks of one scene: lists to be pooled over scenes."""
-    half = len(at.poses) // 2
-    xy, cov = to_world(at.poses, found.xy), turned(at.poses, found.cov)
+def judge(config: slam.Config, at: Scene, found: Nodes, kinds: dict[str, int]) -> dict:
+    """Checks of one scene, by kind of landmark: lists and counts to be pooled over scenes."""
+    place, poses, half = at.place, at.poses, len(at.poses) // 2
+    xy, cov = to_world(poses, found.xy), turned(poses, found.cov)
+    known = np.isfinite(cov).all(axis=(2, 3))
+    inverse = np.linalg.pinv(np.where(known[..., None, None], cov, 0.0))
     out = {}
-    corner_seen = visible_corners(at, config) if CORNER in kinds else None
-    for kind in kinds:
-        name = {NODE: "node", CORNER: "corner"}[kind]
-        true = at.junctions.xy if kind == NODE else at.corners.xy
+    for name, kind in kinds.items():
+        true = place.junctions if kind == NODE else place.corners.xy
         valid = found.valid & (found.kind == kind)
         trusted = valid & found.trusted
-        gap = np.hypot(*np.moveaxis(xy[:, :, None] - true, -1, 0))
-        nearest, off = gap.argmin(axis=-1), gap.min(axis=-1)
+        off, nearest = cKDTree(true).query(xy)
         error = xy - true[nearest]
-        nees = np.einsum("nmi,nmij,nmj->nm", error, np.linalg.pinv(cov), error) / 2
+        nees = np.einsum("nmi,nmij,nmj->nm", error, inverse, error) / 2
+        checks, spreads = 0, []
         one = slice(0, half), slice(half, None)
-        checks, repeats, spreads = 0, 0, []
         for a, b in (one, one[::-1]):
+            ought = trusted[a].copy()
             if kind == NODE:
-                n, m = np.nonzero(trusted[a])
+                n, m = np.nonzero(ought)
                 circles = xy[a][n, m], found.shape[a][n, m]
-                both = [visible_circles(at, at.poses[v][n], *circles, config) for v in (a, b)]
-                ought = np.zeros_like(trusted[a])
+                both = [visible_circles(place, poses[v][n], *circles, config) for v in (a, b)]
                 ought[n, m] = both[0] & both[1]
             else:
-                both = corner_seen[b] & corner_seen[a]
-                ought = np.take_along_axis(both, nearest[a], axis=1) & (off[a] < SPURIOUS)
-            ought &= trusted[a]
+                ought &= np.take_along_axis(at.corners[a] & at.corners[b], nearest[a], axis=1)
+                ought &= off[a] < SPURIOUS
             away = np.hypot(*np.moveaxis(xy[a][:, :, None] - xy[b][:, None], -1, 0))
             away = np.where(valid[b][:, None], away, np.inf).min(axis=-1)
             checks += ought.sum()
-            repeats += (ought & (away < MATCH)).sum()
             spreads.append(away[ought & (away < MATCH)])
         out[name] = {
             "checks": checks,
-            "repeats": repeats,
             "spread": np.concatenate(spreads),
             "trusted": trusted.sum(),
-            "scans": len(at.poses),
+            "scans": len(poses),
             "spurious": (trusted & (off >= SPURIOUS)).sum(),
-            "nees": nees[trusted & (off < SPURIOUS)],
+            "nees": nees[trusted & known & (off < SPURIOUS)],
             "error": off[trusted],
         }
     return out
 
 
-def row(parts: list[dict], kind: str) -> common.Numbers:
+def row(parts: list[dict]) -> common.Numbers:
     """Row of the table: checks of one kind of landmark, pooled over scenes."""
-    total = lambda field: sum(part[kind][field] for part in parts)
-    every = lambda field: np.concatenate([part[kind][field] for part in parts])
+    total = lambda field: sum(part[field] for part in parts)
+    every = lambda field: np.concatenate([part[field] for part in parts])
+    part = lambda some, all: some / all if all else np.nan
+    mean = lambda how, x: float(how(x)) if len(x) else np.nan
     return {
         "checks": int(total("checks")),
-        "repeatability": total("repeats") / max(total("checks"), 1),
-        "spurious": total("spurious") / max(total("trusted"), 1),
-        "spread_m": float(np.median(every("spread"))) if total("repeats") else np.nan,
-        "nees": float(np.mean(every("nees"))) if len(every("nees")) else np.nan,
-        "error_m": float(np.median(every("error"))) if total("trusted") else np.nan,
-        "per_scan": total("trusted") / total("scans"),
+        "repeatability": part(len(every("spread")), total("checks")),
+        "spurious": part(total("spurious"), total("trusted")),
+        "spread_m": mean(np.median, every("spread")),
+        "nees": mean(np.mean, every("nees")),
+        "error_m": mean(np.median, every("error")),
+        "per_scan": part(total("trusted"), total("scans")),
     }
+
+
+def everyone(at: Scene) -> np.ndarray:
+    """All pairs (N,) of a scene."""
+    return np.ones(len(at.poses) // 2, bool)
+
+
+def rows(seen: Seen, case: Case, pick: Callable = everyone, **more) -> list[common.Numbers]:
+    """A row for each world and kind of landmark, of the pairs that `pick` (scene) -> (N,) takes."""
+    result = []
+    for name, scenes in seen.items():
+        place = scenes[0][0].place
+        kinds = {"node": NODE} if case.labels == "thinning" else place.kinds
+        parts = []
+        for at, nodes in scenes:
+            use = pick(at)
+            some = Nodes(*(field[np.tile(use, 2)] for field in nodes))
+            parts.append(judge(case.config, at.take(use), some, kinds))
+        for kind in kinds:
+            head = {"world": name, "labels": case.labels, "noise_m": case.noise, "kind": kind}
+            own = row([part[kind] for part in parts]) | {"truth": place.known_from}
+            result.append(head | more | own)
+    return result
+
+
+def apart(at: Scene) -> np.ndarray:
+    """Distance (N,) [m] between the viewpoints of pairs."""
+    return np.hypot(*np.subtract(*np.split(at.poses[:, :2], 2)).T)
+
+
+def turn(at: Scene) -> np.ndarray:
+    """Difference of heading (N,) [degrees] between the viewpoints of pairs."""
+    off = np.subtract(*np.split(at.poses[:, 2], 2))
+    return np.degrees(np.abs((off + np.pi) % (2 * np.pi) - np.pi))
+
+
+def binned(seen: Seen, size: Callable, edges: tuple[float, ...]) -> list[common.Numbers]:
+    """Rows of the usual case for the pairs whose `size` (scene) -> (N,) lies in each bin."""
+    result = []
+    for low, high in pairwise(edges):
+        pick = lambda at, low=low, high=high: (low <= size(at)) & (size(at) < high)
+        result += rows(seen, USUAL, pick, bin=[low, high])
+    return result
+
+
+def worlds_of(seed: int, plans: int, pairs: int) -> tuple[Worlds, dict[str, str]]:
+    """Scenes of each world, and why a world is left out."""
+    rng = np.random.default_rng(seed)
+    at = lambda place, count: scene(place, rng, count, APART, USUAL.config)
+    keys = tqdm(jax.random.split(jax.random.key(seed), plans), unit="plan", leave=False)
+    worlds = {
+        "office": [at(Drawn(world.named("office").walls), 3 * pairs)],
+        "floor plans": [at(Drawn(world.floor_plan(key).walls), pairs) for key in keys],
+    }
+    try:
+        own = occupancy.read(WILLOW)
+    except InputError as error:
+        return worlds, {"willow": str(error)}
+    return worlds | {"willow": [at(Cells(own.occupied, own.free, own.resolution), 6 * pairs)]}, {}
 
 
 def compute(seed: int, plans: int, pairs: int) -> common.Numbers:
-    """Rows for the office and for random floor plans, both label modes, three noises."""
-    rng = np.random.default_rng(seed)
-    keys = jax.random.split(jax.random.key(seed), plans)
-    worlds = {
-        "office": [scene(world.named("office").walls, rng, 3 * pairs, APART)],
-        "floor plans": [scene(world.floor_plan(key).walls, rng, pairs, APART) for key in keys],
-    }
-    cases = [(labels, noise) for labels in ("runs", "codes") for noise in NOISES]
-    rows = []
-    for labels, noise in tqdm(cases, unit="case", leave=False):
-        config = slam.Config(labels=labels)
-        config = config._replace(lidar=config.lidar._replace(noise=noise))
-        for name, scenes in worlds.items():
-            draw_key = jax.random.fold_in(jax.random.key(seed), len(rows))
-            found = [seen_from(draw_key, config, at) for at in scenes]
-            parts = [judge(config, at, nodes) for at, nodes in zip(scenes, found, strict=True)]
-            head = {"world": name, "labels": labels, "noise_m": noise}
-            rows += [head | {"kind": kind} | row(parts, kind) for kind in ("node", "corner")]
-    return {"seed": seed, "apart_m": APART, "plans": plans, "pairs": pairs, "rows": rows}
+    """Rows for all worlds, label modes and noises, and how the usual case depends on the pair."""
+    lacking = thinning.missing()
+    modes = ("runs", "codes") if lacking else ("runs", "codes", "thinning")
+    cases = [Case(labels, noise) for labels in modes for noise in NOISES] + [COARSE]
+    worlds, left_out = worlds_of(seed, plans, pairs)
+    task = partial(look, jax.random.key(seed), worlds)
+    numbers = {"seed": seed, "plans": plans, "pairs": pairs, "apart_m": APART, "match_m": MATCH}
+    numbers |= {"spurious_beyond_m": SPURIOUS}
+    numbers |= {"not_installed": lacking, "left_out": left_out, "rows": [], "by_step": []}
+    with ThreadPoolExecutor(2) as pool:  # XLA compiles one case on one core
+        every = tqdm(pool.map(task, cases), total=len(cases), unit="case", leave=False)
+        for case, seen in zip(cases, every, strict=True):
+            own = rows(seen, case)
+            numbers["rows"] += own if case.skip == 1 else []
+            if case in (USUAL, COARSE):
+                step = round(np.degrees(case.config.lidar.step), 3)
+                numbers["by_step"] += [r | {"beam_step_deg": step} for r in own]
+            if case == USUAL:
+                numbers["by_distance"] = binned(seen, apart, DISTANCES)
+                numbers["by_heading"] = binned(seen, turn, HEADINGS)
+    return numbers
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """Repeatability over noise, a panel for each kind of landmark."""
-    figure, axes = common.canvas(8, 3.2, 1, 2)
-    for axis, kind in zip(axes[0], ("node", "corner"), strict=True):
-        for labels, colour in (("runs", common.BLUE), ("codes", common.ORANGE)):
-            for name, style in (("office", "o-"), ("floor plans", "s--")):
-                lines = [
-                    (100 * r["noise_m"], 100 * r["repeatability"])
-                    for r in numbers["rows"]
-                    if (r["kind"], r["labels"], r["world"]) == (kind, labels, name)
-                ]
-                axis.plot(*zip(*lines, strict=True), style, color=colour, label=f"{labels}, {name}")
-        axis.set(xlabel="range noise [cm]", ylabel="repeat [%]", title=f"{kind}s", ylim=(0, 102))
+    """Repeatability over noise in each world, then over distance, heading and beams."""
+    figure, axes = common.canvas(9, 5.6, 2, 3)
+    styles = {
+        ("runs", "node"): ("nodes, runs", "o-", common.BLUE),
+        ("codes", "node"): ("nodes, edge codes", "s--", common.ORANGE),
+        ("thinning", "node"): ("nodes, thinning", "^:", common.PINK),
+        ("runs", "corner"): ("corners", "D-.", common.GREEN),
+    }
+
+    def lines(axis, table, title, label, of):
+        for (labels, kind), (name, style, colour) in styles.items():
+            own = [r for r in table if (r["labels"], r["kind"]) == (labels, kind)]
+            if not own:
+                continue
+            repeat = [
+                100 * (np.nan if r["repeatability"] is None else r["repeatability"]) for r in own
+            ]
+            axis.plot([of(r) for r in own], repeat, style, color=colour, label=name, markersize=5)
+        axis.set(title=title, xlabel=label, ylim=(0, 103))
+        axis.margins(x=0.1)
         axis.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=8, loc="lower left")
+
+    names = list(dict.fromkeys(r["world"] for r in numbers["rows"]))
+    for axis, name in zip(axes[0], names, strict=False):
+        table = [r for r in numbers["rows"] if r["world"] == name]
+        lines(axis, table, name, "range noise [cm]", lambda r: f"{100 * r['noise_m']:g}")
+    for axis in axes[0, len(names) :]:
+        axis.axis("off")
+    span = lambda r: "{:g} to {:g}".format(*r["bin"])
+    for axis, key, label, of in (
+        (axes[1, 0], "by_distance", "between viewpoints [m]", span),
+        (axes[1, 1], "by_heading", "between headings [degrees]", span),
+        (axes[1, 2], "by_step", "between beams [degrees]", lambda r: f"{r['beam_step_deg']:g}"),
+    ):
+        table = [r for r in numbers[key] if r["world"] == "floor plans"]
+        lines(axis, table, "floor plans, 1 cm", label, of)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("repeat [%]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.savefig(path)
 
 
@@ -253,11 +281,15 @@ def main(argv: list[str] | None = None) -> None:
     common.save(given.out, "repeatability", numbers, draw)
     for r in numbers["rows"]:
         print(
-            f"{r['labels']:5} {r['world']:11} {r['kind']:6} {100 * r['noise_m']:.0f} cm: "
-            f"repeat {100 * r['repeatability']:5.1f} % of {r['checks']}, "
-            f"spurious {100 * r['spurious']:.1f} %, spread {100 * r['spread_m']:.1f} cm, "
-            f"NEES {r['nees']:.2f}, {r['per_scan']:.2f} a scan"
+            f"{r['labels']:8} {r['world']:11} {r['kind']:6} {100 * r['noise_m']:.0f} cm: "
+            f"repeat {100 * r['repeatability']:5.1f} % of {r['checks']:4}, "
+            f"spurious {100 * r['spurious']:4.1f} %, spread {100 * r['spread_m']:4.1f} cm, "
+            f"NEES {r['nees']:5.2f}, {r['per_scan']:.2f} a scan"
         )
+    for name in numbers["not_installed"]:
+        print(f"{name} is not installed: without thinning")
+    for name, why in numbers["left_out"].items():
+        print(f"without {name}: {why}")
 
 
 if __name__ == "__main__":

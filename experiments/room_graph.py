@@ -12,10 +12,8 @@ from scipy.optimize import root
 from scipy.spatial import Voronoi
 
 from experiments.common import Numbers
-from jaxslam import slam
 from jaxslam.nodes import NodeSpec
 
-CONFIG = slam.Config(nodes=NodeSpec(seen=0.5, hidden=0.3))  # ten scans: no junction is to be lost
 NEAR = 0.1  # [m] places this close are one junction
 SPACING = 0.02  # [m] between the points that stand for a wall
 BRANCH = 0.3  # [rad] between the two feet of a branch, at least
@@ -89,7 +87,7 @@ def refine(place: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float, flo
 def reference(walls: np.ndarray) -> Numbers:
     """Junctions of the room that can be nodes of a map, and the branches that join them."""
     place, joined = branch_graph(walls)
-    spec, junctions = CONFIG.nodes, []
+    spec, junctions = NodeSpec(), []
     for vertex in (v for v, others in joined.items() if len(others) >= 3):
         centre, clearance, spread = refine(place[vertex], walls)
         known = any(np.hypot(*(centre - j["xy"])) < NEAR for j in junctions)

@@ -67,10 +67,11 @@ def stages(config: slam.Config, scans: Scan) -> dict[str, tuple]:
     lidar, grid, spec = config.lidar, config.grid, config.nodes
 
     def cells(scan: Scan, runs: edges.Runs) -> tuple[jax.Array, jax.Array]:
-        return edges.run_bits(scan, lidar, runs, grid), seen_free(scan, lidar, grid)
+        own = edges.run_cells(scan, lidar, runs, grid)
+        return own, slam.start_of(own, seen_free(scan, lidar, grid))
 
-    def found(labels: jax.Array, diagram: voronoi.Diagram, scan: Scan, runs: edges.Runs) -> Any:
-        near = voronoi.junctions(diagram, labels != 0)
+    def found(own: jax.Array, fronts: voronoi.Fronts, scan: Scan, runs: edges.Runs) -> Any:
+        near = voronoi.crowded(fronts, own >= 0)
         return junctions.find_junctions(near, scan, runs, lidar, grid, spec)
 
     def others(runs: edges.Runs) -> tuple[nodes.Nodes, nodes.Nodes]:
@@ -78,14 +79,14 @@ def stages(config: slam.Config, scans: Scan) -> dict[str, tuple]:
 
     runs_of = batched(lambda scan: edges.runs(scan, lidar, config.runs))
     cells_of = batched(cells)
-    grow = batched(partial(voronoi.expand, steps=config.steps))
+    grow = batched(partial(voronoi.grow, steps=config.steps, octagon=True))
     runs = runs_of(scans)
-    labels, open = cells_of(scans, runs)
+    own, start = cells_of(scans, runs)
     return {
         "runs": (runs_of, scans),
         "labels_and_free_cells": (cells_of, scans, runs),
-        "automaton": (grow, labels, open),
-        "junctions": (batched(found), labels, grow(labels, open), scans, runs),
+        "automaton": (grow, start),
+        "junctions": (batched(found), own, grow(start), scans, runs),
         "corners_and_walls": (batched(others), runs),
     }
 

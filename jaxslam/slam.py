@@ -104,6 +104,12 @@ def front_end(config: Config, scan: Scan) -> Nodes:
     return look(config, scan)[0]
 
 
+def start_of(run: Array, open: Array) -> Array:
+    """Cells (H, W) int8 that fronts start from: runs (H, W) int8, and what they may enter."""
+    empty = jnp.where(open, voronoi.EMPTY, voronoi.SHUT).astype(jnp.int8)
+    return jnp.where(run >= 0, run, empty)
+
+
 def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
     """Landmarks of one scan, with the diagram they came from and its source cells (H, W)."""
     lidar, spec = config.lidar, config.grid
@@ -117,8 +123,7 @@ def look(config: Config, scan: Scan) -> tuple[Nodes, voronoi.Diagram, Array]:
         run = edges.run_cells(scan, lidar, runs, spec)
         sources = run >= 0
         labels = jnp.where(sources, jnp.uint32(1) << jnp.maximum(run, 0).astype(jnp.uint32), 0)
-        shut = jnp.where(seen_free(scan, lidar, spec), voronoi.EMPTY, voronoi.SHUT)
-        start = jnp.where(sources, run, shut.astype(jnp.int8))
+        start = start_of(run, seen_free(scan, lidar, spec))
     octagon = config.labels == "runs"  # the paper's fronts are diamonds
     fronts = voronoi.grow(start, steps=config.steps, octagon=octagon)
     diagram = voronoi.gather(labels, fronts, octagon=octagon)

@@ -134,7 +134,7 @@ def _batched(steps: int, octagon: bool) -> Callable[[Array], tuple[Array, Array]
 class Fronts(NamedTuple):
     """How far fronts of sources with one label each have come."""
 
-    cells: Array  # (H, W) int8 number of the label that holds a cell alone, or EMPTY, or SHUT
+    cells: Array  # (H, W) int8 number of the label that holds a cell alone, EMPTY, or less: shut
     waited: Array  # (H, W) unsigned, states from 0 on in which it was empty: step of arrival
 
 
@@ -144,7 +144,12 @@ def number(labels: Array, open: Array) -> Array:
     Args:
         labels: (H, W) unsigned bit sets.
         open: (H, W) bool, the cells that fronts may enter.
+
+    Raises:
+        ValueError: An argument has another shape or type; while tracing.
     """
+    expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
+    expect("open", open, labels.shape, jnp.bool_)
     own = lax.population_count(labels - 1).astype(jnp.int8)
     own = jnp.where((labels != 0) & (labels & (labels - 1) == 0), own, SHUT)
     return jnp.where((labels == 0) & open, EMPTY, own).astype(jnp.int8)
@@ -157,6 +162,9 @@ def grow(start: Array, *, steps: int, octagon: bool = False) -> Fronts:
         start: (H, W) int8 as of `number`.
         steps: Number of steps; a front advances one cell a step.
         octagon: As of `expand`.
+
+    Raises:
+        ValueError: `start` has another shape or type, or `steps` is negative; while tracing.
     """
     expect("start", start, ("H", "W"), jnp.int8)
     if steps < 0:
@@ -172,7 +180,12 @@ def gather(labels: Array, fronts: Fronts, *, octagon: bool = False) -> Diagram:
         labels: (H, W) unsigned bit sets of the sources.
         fronts: What grew from them.
         octagon: As it grew.
+
+    Raises:
+        ValueError: An argument has another shape or type; while tracing.
     """
+    expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
+    expect("fronts.cells", fronts.cells, labels.shape, jnp.int8)
     cells = jnp.pad(fronts.cells, 1, constant_values=SHUT)
     waited, own = jnp.pad(fronts.waited, 1), fronts.waited
     one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
@@ -204,8 +217,6 @@ def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> 
     References:
         Paper, section 2.1, Figs. 1 and 2.
     """
-    expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
-    expect("open", open, labels.shape, jnp.bool_)
     fronts = grow(number(labels, open), steps=steps, octagon=octagon)
     return gather(labels, fronts, octagon=octagon)
 
@@ -218,7 +229,12 @@ def crowded(fronts: Fronts, sources: Array) -> Array:
     Args:
         fronts: Result of `grow`.
         sources: (H, W) bool, the cells they came from.
+
+    Raises:
+        ValueError: An argument has another shape or type; while tracing.
     """
+    expect("fronts.cells", fronts.cells, ("H", "W"), jnp.int8)
+    expect("sources", sources, fronts.cells.shape, jnp.bool_)
     own = jnp.where(sources, jnp.int8(SHUT), fronts.cells)
     p = jnp.pad(own, 1, constant_values=SHUT)
     block = (own, *_beside(p), *_across(p))

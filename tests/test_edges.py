@@ -13,7 +13,7 @@ from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.world import World
 
 runs = jax.jit(edges.runs, static_argnums=(1, 2))
-run_bits = jax.jit(edges.run_bits, static_argnums=(1, 3))
+run_cells = jax.jit(edges.run_cells, static_argnums=(1, 3))
 cast = jax.jit(lidar.cast, static_argnums=2)
 
 SCANNER, SPEC = Lidar(), RunSpec()
@@ -121,14 +121,18 @@ def test_a_straight_wall_is_one_run_whatever_its_direction(heading):
 
 
 def test_beams_of_a_run_lie_on_its_line():
+    """But for a single beam beside it, at its end, which is cheaper as stray than as a run."""
     scan, found = seen(world.named("office").walls, (8.1, 5.03, 1.9))
     of, valid = np.asarray(found.of_beam), np.asarray(found.valid)
-    owned = (of < SPEC.capacity) & valid[np.minimum(of, SPEC.capacity - 1)]
+    owned = np.flatnonzero((of < SPEC.capacity) & valid[np.minimum(of, SPEC.capacity - 1)])
     k = of[owned]
     off = np.asarray(points(scan, SCANNER))[owned] - np.asarray(found.centre)[k]
     off = np.abs(np.sum(off * np.asarray(found.normal)[k], axis=1))
-    assert off.max() < SPEC.bend and np.median(off) < 1e-9
-    assert valid.sum() > 5
+    assert valid.sum() > 5 and np.median(off) < 1e-9
+    stray = off > math.sqrt(SPEC.outlier) * SCANNER.noise / 2
+    assert np.bincount(k[stray]).max(initial=0) <= 1 and stray.sum() < 0.02 * stray.size
+    ends = (of != np.roll(of, 1)) | (of != np.roll(of, -1))
+    assert ends[owned[stray]].all()
 
 
 def test_the_line_fit_is_as_uncertain_as_it_says():
@@ -174,29 +178,28 @@ def test_more_stretches_than_runs_share_one_label():
     np.testing.assert_array_equal(found.valid, np.arange(SPEC.capacity) != shared)
 
 
-def test_every_hit_starts_its_label_even_when_labels_are_shared():
+def test_every_hit_lies_on_a_cell_of_its_run_even_when_runs_share_a_number():
     scan, scanner = comb([5 + k % 4 for k in range(SPEC.capacity + 20)])
     found = runs(scan, scanner, SPEC)
     spec = GridSpec(ahead=5.0, behind=5.0, side=5.0)
-    bits = np.asarray(run_bits(scan, scanner, found, spec))
-    at = np.asarray(cell_of(points(scan, scanner), spec))
-    label = np.uint32(1) << np.asarray(found.of_beam).astype(np.uint32)
-    assert (bits[tuple(at.T)] != 0).all()
-    # A cell may hold the labels of two runs that meet in it, and three at most lose one.
-    assert np.mean(bits[tuple(at.T)] & label != 0) > 0.95
-    assert bits.dtype == np.uint32 and bits.max() < 2**SPEC.capacity
+    drawn = np.asarray(run_cells(scan, scanner, found, spec))
+    at, of = np.asarray(cell_of(points(scan, scanner), spec)), np.asarray(found.of_beam)
+    here = drawn[tuple(at.T)]
+    assert (here >= of).all()  # where two runs share a cell, the later has it
+    assert np.mean(here == of) > 0.9
+    assert drawn.dtype == np.int8 and drawn.min() == -1 and drawn.max() == of.max()
 
 
-def test_beams_that_hit_nothing_start_no_label():
+def test_beams_that_hit_nothing_draw_no_run():
     nothing = Scan(ranges=jnp.full(361, 10.0), hit=jnp.zeros(361, bool))
     found = runs(nothing, SCANNER, SPEC)
     assert not found.valid.any() and np.all(found.of_beam == SPEC.capacity)
-    assert not run_bits(nothing, SCANNER, found, GridSpec()).any()
+    np.testing.assert_array_equal(run_cells(nothing, SCANNER, found, GridSpec()), -1)
 
 
-def test_labels_of_a_run_have_no_gaps():
+def test_cells_of_a_run_have_no_gaps():
     scan, found = seen([[0.5, 0.5, 6.0, 0.5]], (0.0, 0.0, 0.0))  # grazing: hits far apart
-    bits = np.asarray(run_bits(scan, SCANNER, found, GridSpec()))
-    rows = np.flatnonzero((bits != 0).any(axis=1))
+    drawn = np.asarray(run_cells(scan, SCANNER, found, GridSpec()))
+    rows = np.flatnonzero((drawn >= 0).any(axis=1))
     assert np.all(np.diff(rows) == 1) and rows[-1] - rows[0] > 50
-    assert set(bits[bits != 0]) == {1}
+    assert set(drawn.ravel()) == {-1, 0}

@@ -7,50 +7,175 @@ import pytest
 
 from jaxslam import edges, lidar, lines, world
 from jaxslam.edges import RunSpec
-from jaxslam.lidar import Lidar
+from jaxslam.lidar import Lidar, Scan
 from jaxslam.lines import NONE, Spans
 
 SPEC = RunSpec()
+SMALL = Lidar(beams=61, first=-math.pi / 3, step=math.pi / 90, noise=0.01)
+SCANS, PRICE, STEEP = 24, SPEC.price, 10.0
 runs = jax.jit(edges.runs, static_argnums=(1, 2))
-split = jax.jit(lines.split, static_argnames=("tolerance", "rounds"))
-merge = jax.jit(lines.merge, static_argnames=("tolerance", "rounds"))
 
 
-def spans_of(*pairs, capacity=12):
-    pad = capacity - len(pairs)
-    first, last = [a for a, _ in pairs] + [NONE] * pad, [b for _, b in pairs] + [-1] * pad
-    return Spans(jnp.array(first, jnp.int32), jnp.array(last, jnp.int32))
+def angles(scanner):
+    return scanner.first + scanner.step * np.arange(scanner.beams)
 
 
-def pairs_of(spans):
-    return [
-        (a, b) for a, b in zip(spans.first.tolist(), spans.last.tolist(), strict=True) if b >= 0
-    ]
+def cut(ranges, hit, breaks, *, lanes=16, price=PRICE, outlier=SPEC.outlier, steep=STEEP):
+    """Where stretches begin (N, R), of scans."""
+
+    @jax.jit
+    @jax.vmap
+    def one(ranges, hit, breaks):
+        scan = Scan(ranges, hit)
+        return lines.partition(
+            scan, breaks, SMALL, 0.01, price=price, outlier=outlier, lanes=lanes, steep=steep
+        )
+
+    return jax.tree.map(np.asarray, one(*map(jnp.asarray, (ranges, hit, breaks))))
 
 
-def slow_split(first, last, xy, tolerance):
-    """Split one stretch at the point furthest from its chord, until none is too far."""
-    chord = xy[last] - xy[first]
-    d = xy[first : last + 1] - xy[first]
-    off = np.abs(d[:, 1] * chord[0] - d[:, 0] * chord[1]) / np.hypot(*chord)
-    if off.max() <= tolerance:
-        return [(first, last)]
-    at = first + int(np.argmax(off))
-    return slow_split(first, at - 1, xy, tolerance) + slow_split(at, last, xy, tolerance)
+@pytest.fixture(scope="module")
+def scans():
+    """Ranges, hits and breaks (N, R) of polylines with noise; some beams did not return."""
+    random = np.random.default_rng(0)
+    turn, ranges = angles(SMALL), np.empty((SCANS, SMALL.beams))
+    for r in ranges:
+        knots = np.sort(random.uniform(-1.2, 1.2, 4))
+        at = random.uniform(1.0, 4.0, 6)[:, None] * np.stack(
+            [np.cos([-1.5, *knots, 1.5]), np.sin([-1.5, *knots, 1.5])], axis=1
+        )
+        # On a line the inverse range is a sinusoid of the bearing.
+        part = np.searchsorted(knots, turn)
+        ends = np.stack([at[part], at[part + 1]], axis=1)
+        across = np.linalg.solve(ends, np.ones((SMALL.beams, 2, 1)))[..., 0]
+        r[:] = 1 / np.sum(across * np.stack([np.cos(turn), np.sin(turn)], axis=1), axis=1)
+    hit = random.random(ranges.shape) > 0.05
+    ranges = np.where(hit, ranges + SMALL.noise * random.normal(size=ranges.shape), SMALL.reach)
+    breaks = ~hit | ~np.roll(hit, 1, axis=1) | (random.random(ranges.shape) < 0.03)
+    breaks[:, 0] = True
+    return ranges, hit, breaks
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_split_agrees_with_recursion(seed):
-    random = np.random.default_rng(seed)
-    turns = np.repeat(random.uniform(-1, 1, 5), 8)
-    xy = np.cumsum(0.1 * np.stack([np.cos(turns), np.sin(turns)], axis=1), axis=0)
-    ours = split(spans_of((0, 39)), jnp.asarray(xy), tolerance=0.06, rounds=8)
-    wanted = slow_split(0, 39, xy, 0.06)
-    assert pairs_of(ours) == wanted and len(wanted) > 1
+def misfits(ranges, steep=STEEP):
+    """Cost (R, R) of the stretch from one beam to another: of the line that fits it best.
+
+    The inverse ranges are those of the line a cos(turn) + b sin(turn), turned to the first beam,
+    with standard deviations that follow from those of the ranges, and b is about 0 beforehand.
+    """
+    q, turn = 1 / ranges, angles(SMALL)
+    cost = np.full((q.size, q.size), np.nan)
+    for i in range(q.size):
+        c, s = np.cos(turn[i:] - turn[i]), np.sin(turn[i:] - turn[i])
+        rows = np.stack([c, s], axis=1) / (0.01 * q[i:] ** 2)[:, None]
+        right = q[i:] / (0.01 * q[i:] ** 2)
+        rows = np.concatenate([[[0.0, 1 / (steep * q[i])]], rows])
+        right = np.append(0.0, right)
+        for j in range(i, q.size):
+            most = j - i + 2
+            line = np.linalg.lstsq(rows[:most], right[:most], rcond=None)[0]
+            cost[i, j] = np.sum((rows[:most] @ line - right[:most]) ** 2)
+    return cost
 
 
-@pytest.mark.parametrize("step", [0.5, 1.0])
-@pytest.mark.parametrize("noise", [0.01, 0.03])
+def price_of(begins, misfit, price=PRICE):
+    """Cost of a cut (R,) bool."""
+    first = np.flatnonzero(begins)
+    last = np.append(first[1:], begins.size) - 1
+    return np.sum(misfit[first, last] + price)
+
+
+def slow_cut(misfit, alone, price):
+    """The cut that costs least: the best of all first beams of the last stretch, and so on."""
+    best, first = [0.0], []
+    for j in range(len(alone)):
+        since = max(i for i in range(j + 1) if alone[i] or i == 0)
+        starts = np.arange(since, j + 1)
+        cost = np.array(best)[starts] + price + misfit[starts, j]
+        best.append(cost.min())
+        first.append(starts[np.argmin(cost)])
+    begins, last = np.zeros(len(alone), bool), len(alone) - 1
+    while last >= 0:
+        begins[first[last]] = True
+        last = first[last] - 1
+    return begins
+
+
+@pytest.mark.parametrize("price", [PRICE, 6.0])  # the second cuts into the noise
+def test_no_cut_costs_less_and_a_few_lanes_all_but_suffice(scans, price):
+    ranges, hit, breaks = scans
+    every, few = (
+        cut(*scans, lanes=n, price=price, outlier=np.inf).begins for n in (SMALL.beams, SPEC.lanes)
+    )
+    cheap = 0
+    for r, alone, ours, lean in zip(ranges, breaks | ~hit, every, few, strict=True):
+        misfit = misfits(r)
+        best = slow_cut(misfit, alone, price)
+        np.testing.assert_array_equal(ours, best)
+        assert 5 <= best.sum() < 30
+        excess = price_of(lean, misfit, price) - price_of(best, misfit, price)
+        assert excess > -1e-6
+        cheap += excess < 1e-6
+    assert cheap >= 0.9 * SCANS
+
+
+def test_stretches_begin_at_breaks_and_hold_no_beam_without_return(scans):
+    _, hit, breaks = scans
+    begins = cut(*scans).begins
+    assert begins[breaks].all() and begins[~hit].all()
+    assert not begins[hit & ~breaks].all() and begins[hit & ~breaks].any()
+    for k in range(SCANS):
+        spans = lines.longest(jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40)
+        member = np.asarray(spans.of_beam(SMALL.beams)) < 40
+        np.testing.assert_array_equal(member, hit[k])
+
+
+def test_the_mirrored_scan_is_cut_at_the_mirrored_beams(scans):
+    """Up to ties: of a few beams those in the middle may go with either side, at equal cost."""
+    ranges, hit, breaks = scans
+    turned = breaks.copy()
+    turned[:, 1:] = breaks[:, :0:-1]  # before a beam is after it
+    back_to_front = ranges[:, ::-1], hit[:, ::-1], turned
+    here, there = (
+        cut(*scan, lanes=SMALL.beams, outlier=np.inf, steep=1e3).begins
+        for scan in (scans, back_to_front)
+    )
+    back = np.ones_like(there)
+    back[:, 1:] = there[:, :0:-1]
+    assert np.mean(np.all(here == back, axis=1)) >= 0.7
+    for k in range(SCANS):
+        misfit = misfits(ranges[k], steep=1e3)
+        np.testing.assert_allclose(price_of(here[k], misfit), price_of(back[k], misfit), atol=1e-3)
+
+
+def test_a_beam_that_strays_does_not_cut_a_wall():
+    """Nor does it move it."""
+    turn, beams = angles(SMALL), np.arange(3, 58, 3)
+    wall = 2.0 / np.cos(turn - 0.2)
+    ranges = np.tile(wall, (len(beams), 1))
+    ranges += 0.005 * np.random.default_rng(0).normal(size=ranges.shape)
+    clean, hit, breaks = ranges.copy(), ranges > 0, np.tile(np.arange(61) == 0, (len(beams), 1))
+    ranges[np.arange(len(beams)), beams] += 0.15
+    strayed, straight = cut(ranges, hit, breaks), cut(clean, hit, breaks)
+    np.testing.assert_array_equal(strayed.begins, breaks)
+    np.testing.assert_array_equal(straight.begins, breaks)
+    np.testing.assert_allclose(strayed.normal[:, -1], straight.normal[:, -1], atol=0.01)
+    np.testing.assert_allclose(straight.normal[:, -1, 0], math.cos(0.2), atol=0.01)
+    assert (cut(ranges, hit, breaks, outlier=np.inf).begins.sum(axis=1) >= 3).all()
+
+
+@pytest.mark.parametrize("ranges", [0.0, SMALL.reach])
+def test_a_scan_without_returns_has_no_runs_and_finite_numbers(ranges):
+    nothing = Scan(jnp.full(61, ranges), jnp.zeros(61, bool))
+    parts = cut(nothing.ranges[None], nothing.hit[None], nothing.hit[None])
+    assert parts.begins.all() and np.isfinite(parts.normal).all()
+    spans = lines.longest(jnp.asarray(parts.begins[0]), nothing.hit, capacity=5)
+    assert spans.first.tolist() == [NONE] * 5 and spans.last.tolist() == [-1] * 5
+    found = runs(nothing, SMALL, SPEC)
+    assert not found.valid.any() and not found.meets.any()
+    assert all(np.isfinite(np.asarray(field, float)).all() for field in found)
+
+
+@pytest.mark.parametrize("noise, step", [(0.01, 1.0), (0.03, 0.5)])
 def test_a_straight_noisy_wall_is_one_run(noise, step):
     beams = int(100 / step) + 1
     scanner = Lidar(beams=beams, first=-math.radians(50), step=math.radians(step), noise=noise)
@@ -75,32 +200,41 @@ def test_a_corner_is_put_at_its_beam(noise):
     assert of[0] == 0 and of[-1] == 1
 
 
-@pytest.mark.parametrize("bend, wanted", [(0.0, [(0, 19)]), (0.3, [(0, 9), (10, 19)])])
-def test_merge_joins_what_lies_on_one_line(bend, wanted):
-    x = 0.1 * np.arange(20.0)
-    xy = jnp.asarray(np.stack([x, bend * np.maximum(x - 0.95, 0)], axis=1))
-    parts = spans_of((0, 4), (5, 9), (10, 14), (15, 19))
-    ours = merge(parts, xy, jnp.zeros(20, bool), tolerance=0.02, rounds=4)
-    assert pairs_of(ours) == wanted
-    apart = jnp.arange(20) == 5
-    assert (0, 4) in pairs_of(merge(parts, xy, apart, tolerance=0.02, rounds=4))
+def pairs_of(spans):
+    pairs = zip(spans.first.tolist(), spans.last.tolist(), strict=True)
+    return [(a, b) for a, b in pairs if b >= 0]
 
 
-def test_those_with_fewest_beams_are_left_out():
-    spans = spans_of((0, 4), (5, 6), (7, 9), (10, 10), (11, 20))
-    kept = lines.longest(spans, capacity=3)
+def test_the_longest_are_kept_in_the_order_of_the_beams():
+    begins = jnp.isin(jnp.arange(24), jnp.array([0, 5, 7, 10, 11, 21]))
+    hit = jnp.arange(24) < 21
+    kept = lines.longest(begins, hit, capacity=3)
     assert pairs_of(kept) == [(0, 4), (7, 9), (11, 20)]
-    np.testing.assert_array_equal(kept.of_beam(12), [0] * 5 + [3] * 2 + [1] * 3 + [3] + [2])
-    padded = lines.longest(spans_of((0, 4)), capacity=3)
-    assert padded.first.tolist() == [0, NONE, NONE] and padded.last.tolist() == [4, -1, -1]
+    of = [0] * 5 + [3] * 2 + [1] * 3 + [3] + [2] * 10 + [3] * 3
+    np.testing.assert_array_equal(kept.of_beam(24), of)
+    np.testing.assert_array_equal(kept.size, [5, 3, 10])
+    more = lines.longest(begins, hit, capacity=7)
+    assert pairs_of(more) == [(0, 4), (5, 6), (7, 9), (10, 10), (11, 20)]
+    assert more.first.tolist()[5:] == [NONE] * 2 and more.last.tolist()[5:] == [-1] * 2
 
 
-def test_moments_of_two_sets_add_up():
-    xy = jnp.asarray(np.random.default_rng(0).normal(size=(30, 2)))
-    weight = jnp.linspace(0.5, 2.0, 30)
-    of = jnp.asarray(np.arange(30) % 2, jnp.int32)
-    take = lambda sums, k: jax.tree.map(lambda x: x[k : k + 1], sums)
-    parts = lines.moments(xy, weight, of, lines=2)
-    whole = lines.moments(xy, weight, jnp.zeros(30, jnp.int32), lines=1)
-    both = lines.joined(take(parts, 0), take(parts, 1))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), both, whole)
+def test_padding_holds_no_beam():
+    padded = Spans(jnp.array([0, NONE], jnp.int32), jnp.array([4, -1], jnp.int32))
+    np.testing.assert_array_equal(padded.size, [5, 0])
+    np.testing.assert_array_equal(padded.of_beam(6), [0] * 5 + [2])
+
+
+def test_moments_and_principal_axes_are_those_of_numpy():
+    random = np.random.default_rng(0)
+    xy, weight, of = random.normal(size=(40, 2)), random.uniform(0.5, 2, 40), np.arange(40) % 4
+    xy = xy @ np.array([[2.0, 0.3], [0.0, 0.4]]) + 3.0
+    sums = lines.moments(*map(jnp.asarray, (xy, weight, of.astype(np.int32))), lines=3)
+    normal, across, along = lines.principal(sums.scatter)
+    for k in range(3):  # those of the fourth count nowhere
+        own = of == k
+        scatter = np.cov(xy[own].T, aweights=weight[own], ddof=0) * weight[own].sum()
+        np.testing.assert_allclose(sums.weight[k], weight[own].sum())
+        np.testing.assert_allclose(sums.mean[k], np.average(xy[own], axis=0, weights=weight[own]))
+        value, vector = np.linalg.eigh(scatter)
+        np.testing.assert_allclose([across[k], along[k]], value)
+        np.testing.assert_allclose(np.abs(vector[:, 0] @ normal[k]), 1.0)

@@ -1,6 +1,6 @@
 """Arcs between the junctions of one scan, against a walk over the branch cells in plain Python."""
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ GRID, COUNT = CONFIG.grid, CONFIG.nodes.nodes
 MIDDLE = np.asarray(centres(GRID))
 AT = 2.5 * GRID.cell  # [m] cells this close to a junction belong to it
 
-# A corridor 2 m wide with three openings on its left: a junction before each.
+# A corridor 2 m wide with three openings on its left: a junction before each, and at its end.
 OPENINGS = [(1.6, 3.0), (3.8, 5.2), (6.0, 7.4)]
 COMB = world.outline([(-0.5, -1.0, 8.5, 1.0), *[(a, 1.0, b, 3.0) for a, b in OPENINGS]])
 IN_COMB = (0.1, -0.3, 0.1)
@@ -94,27 +94,29 @@ def walk(found, diagram, sources):
     return {pair for met in meets for pair in combinations(sorted(met), 2)}
 
 
-def test_junctions_before_the_openings_of_a_corridor_are_joined_one_after_the_other():
+def test_junctions_of_a_corridor_with_openings_are_joined_one_after_the_other():
     found, *rest = scene(COMB, IN_COMB)
     place = np.asarray(to_world(jnp.array(IN_COMB), found.xy))[:COUNT]
     order = [k for k in np.argsort(place[:, 0]) if found.valid[k]]
-    # Its circle touches the right wall and the two corners of the opening.
-    want = [((a + b) / 2, (b - a) ** 2 / 16) for a, b in OPENINGS]
+    # Its circle touches the right wall and the two corners of the opening; that of the fourth,
+    # at the end of the corridor, all its three walls.
+    want = [*(((a + b) / 2, (b - a) ** 2 / 16) for a, b in OPENINGS), (7.5, 0.0)]
     np.testing.assert_allclose(place[order], want, atol=0.03)
     links = find(found, *rest)
-    first, second, third = order
-    assert joined(links) == {tuple(sorted(p)) for p in ((first, second), (second, third))}
+    assert joined(links) == {tuple(sorted(p)) for p in pairwise(order)}
     assert joined(links) == walk(found, *rest[:2])
 
 
-@pytest.mark.parametrize("walls, pose", [(COMB, IN_COMB), ("fig07", (0.7, 1.3, -0.39))])
-def test_a_line_follows_the_branch_cells_from_end_to_end(walls, pose):
+@pytest.mark.parametrize(
+    "walls, pose, count", [(COMB, IN_COMB, 3), ("fig07", (0.7, 1.3, -0.39), 2)]
+)
+def test_a_line_follows_the_branch_cells_from_end_to_end(walls, pose, count):
     walls = world.named(walls).walls if isinstance(walls, str) else walls
     found, diagram, sources, scan = scene(walls, pose)
     links = find(found, diagram, sources, scan)
     hits = np.asarray(lidar.points(scan, CONFIG.lidar))
     cells = MIDDLE[np.asarray(voronoi.branches(diagram, sources))]
-    assert len(joined(links)) == 2 and len(frontiers(links)) >= 2
+    assert len(joined(links)) == count and len(frontiers(links)) >= 2
     for k in np.flatnonzero(links.valid):
         line, pair = np.asarray(links.line[k]), np.asarray(links.pair[k])
         ends = np.asarray(found.xy)[pair[pair >= 0]]
@@ -272,9 +274,10 @@ def test_where_no_front_arrives_an_arc_is_cut():
     fenced = diagram._replace(labels=jnp.where(jnp.abs(x - 3.4) < 0.3, 0, diagram.labels))
     place = np.asarray(to_world(jnp.array(IN_COMB), found.xy))[:COUNT, 0]
     near = {k for k in np.flatnonzero(found.valid[:COUNT]) if place[k] < 3.4}
-    pairs = joined(find(found, fenced, sources, scan))
-    assert len(near) == 1 and len(pairs) == 1
-    assert all((i in near) == (j in near) for i, j in pairs)
+    pairs = joined(find(found, diagram, sources, scan))
+    within = {(i, j) for i, j in pairs if (i in near) == (j in near)}
+    assert len(near) == 1 and len(pairs) == len(within) + 1 == 3
+    assert joined(find(found, fenced, sources, scan)) == within
 
 
 @pytest.mark.parametrize("junk", [3.0, jnp.nan])
@@ -306,7 +309,7 @@ def test_arguments_that_do_not_fit_are_named():
     few = found._replace(xy=found.xy[:3])
     small = diagram._replace(labels=diagram.labels[:-1])
     for wrong, told in (
-        ((few, diagram, sources), r"found.xy is \(3, 2\), not \(M >= 6, 2\)"),
+        ((few, diagram, sources), rf"found.xy is \(3, 2\), not \(M >= {COUNT}, 2\)"),
         ((found, small, sources), r"diagram.labels is \(81, 160\), not .* \(82, 160\)"),
         ((found, diagram, sources.astype(int)), "sources is int64, not bool"),
     ):

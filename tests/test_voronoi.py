@@ -7,7 +7,18 @@ import pytest
 import reference
 from scipy.ndimage import distance_transform_cdt
 
-from jaxslam.voronoi import Diagram, branches, expand, junctions
+from jaxslam.voronoi import (
+    EMPTY,
+    SHUT,
+    Diagram,
+    branches,
+    crowded,
+    expand,
+    gather,
+    grow,
+    junctions,
+    number,
+)
 
 STEPS = 60  # more than any front needs on the grids below
 SEEDS = range(4)
@@ -261,7 +272,54 @@ def test_one_source_grows_as_an_octagon(steps):
     np.testing.assert_array_equal(reached, inside)
 
 
+def numbered(bits, open):
+    """What fronts of numbers start from, cell by cell."""
+    start = np.full(bits.shape, SHUT, np.int8)
+    start[open & (bits == 0)] = EMPTY
+    for cell in np.argwhere(bits):
+        if reference.bits(int(bits[tuple(cell)])) == 1:
+            start[tuple(cell)] = int(bits[tuple(cell)]).bit_length() - 1
+    return start
+
+
+@jax.jit
+def fronts_of(start, bits):
+    """Fronts of both kinds, and their sets."""
+    both = [grow(start, steps=9, octagon=octagon) for octagon in (False, True)]
+    return both, [gather(bits, f, octagon=k == 1) for k, f in enumerate(both)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_numbers_grow_as_sets_do(seed):
+    bits, open = random_grid(seed, labels=32, dtype=np.uint32)
+    bits[3, 4] = bits[15, 20] = 3 << seed  # sources of two labels
+    start = numbered(bits, open)
+    np.testing.assert_array_equal(number(jnp.asarray(bits), jnp.asarray(open)), start)
+    slow = reference.expand(bits, open, 9), reference.expand_octagons(bits, open, 9)
+    for fronts, diagram, (labels, arrival) in zip(*fronts_of(start, bits), slow, strict=True):
+        np.testing.assert_array_equal(diagram.labels, labels)
+        np.testing.assert_array_equal(diagram.arrival, arrival)
+        alone = np.vectorize(reference.bits)(labels) == 1
+        np.testing.assert_array_equal(np.asarray(fronts.cells) >= 0, alone)
+        np.testing.assert_array_equal(fronts.cells[alone], np.log2(labels[alone]))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cells_are_crowded_where_three_numbers_are_near(seed):
+    bits, open = random_grid(seed, labels=32, dtype=np.uint32)
+    sources = bits != 0
+    fronts = fronts_of(numbered(bits, open), bits)[0][seed % 2]
+    cells, expected = np.asarray(fronts.cells), np.zeros(bits.shape, bool)
+    for cell in np.ndindex(*bits.shape):
+        block = [near for near in reference.block(cell, bits.shape) if not sources[near]]
+        held = {int(cells[near]) for near in block if cells[near] >= 0}
+        expected[cell] = len(held) >= 3 and not sources[cell] and cells[cell] != EMPTY
+    np.testing.assert_array_equal(crowded(fronts, jnp.asarray(sources)), expected)
+    assert 5 < expected.sum() < expected.size / 2
+
+
 CELLS, MASK = jnp.zeros((4, 5), jnp.uint8), jnp.zeros((4, 5), bool)
+BYTES = jnp.zeros((4, 5), jnp.int8)
 GOOD = Diagram(labels=CELLS, arrival=jnp.zeros((4, 5), jnp.int32))
 
 
@@ -276,6 +334,9 @@ GOOD = Diagram(labels=CELLS, arrival=jnp.zeros((4, 5), jnp.int32))
         (lambda: expand(CELLS, MASK[1:], steps=1), "open is bool (3, 5), not bool (4, 5)"),
         (lambda: expand(CELLS, CELLS, steps=1), "open is uint8 (4, 5), not bool (4, 5)"),
         (lambda: expand(CELLS, MASK, steps=-1), "steps is -1, not 0 or more"),
+        (lambda: grow(MASK, steps=1), "start is bool (4, 5), not int8 (H, W)"),
+        (lambda: grow(BYTES[0], steps=1), "start is int8 (5,), not int8 (H, W)"),
+        (lambda: grow(BYTES, steps=-2), "steps is -2, not 0 or more"),
         (lambda: branches(GOOD, MASK[:, 1:]), "sources is bool (4, 4), not bool (4, 5)"),
         (lambda: junctions(GOOD, CELLS), "sources is uint8 (4, 5), not bool (4, 5)"),
         (lambda: junctions(Diagram(MASK, MASK), MASK), "diagram.labels is bool (4, 5), not"),

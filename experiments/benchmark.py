@@ -10,13 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.one_core import least, seconds  # isort: skip  # before JAX starts its threads
-
 import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
 from experiments import common, peers
+from experiments.one_core import least, pin, seconds
 from jaxslam import edges, junctions, monte_carlo, nodes, slam, voronoi
 from jaxslam.grid import seen_free
 from jaxslam.lidar import Scan, cast
@@ -165,6 +164,7 @@ def bars(axis: Any, values: dict[str, float], form: str, title: str) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     """Run the benchmark."""
+    pin()
     given = common.parse(__doc__, argv, runs=4, maps=256, repeats=3)
     numbers = compute(given.seed, given.runs, given.maps, given.repeats)
     common.save(given.out, "benchmark", numbers, draw)

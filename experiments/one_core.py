@@ -1,15 +1,23 @@
-"""Time on one core. Import this before JAX, whose threads stay on the core they start on."""
+"""Time on one core."""
 
 import gc
 import os
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-
 import jax
+
+THREADS = Path("/proc/self/task")
+
+
+def pin() -> None:
+    """Keep this process on one core, where the system can; before JAX does its first work."""
+    if hasattr(os, "sched_setaffinity") and THREADS.is_dir():
+        core = {min(os.sched_getaffinity(0))}
+        for thread in THREADS.iterdir():
+            os.sched_setaffinity(int(thread.name), core)
 
 
 def seconds(function: Callable, *arguments: Any) -> float:

@@ -14,13 +14,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.one_core import least, seconds  # isort: skip  # before JAX starts its threads
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import Numbers
+from experiments.one_core import least, seconds
 from jaxslam.voronoi import Diagram, expand
 
 SIZE, STEPS = 128, 64

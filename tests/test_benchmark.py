@@ -2,22 +2,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.voronoi import expand
-
-try:  # importing it keeps the process on one core, which the tests after it should not suffer
-    import os
-
-    CORES = os.sched_getaffinity(0)
-except AttributeError:
-    CORES = None
-
 from experiments import benchmark, peers
-
-
-@pytest.fixture(autouse=True, scope="module")
-def all_cores():
-    if CORES:
-        os.sched_setaffinity(0, CORES)
+from jaxslam.voronoi import expand
 
 
 def test_without_the_c_program_its_figures_are_null_and_a_note_says_why(tmp_path, monkeypatch):

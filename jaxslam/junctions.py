@@ -103,7 +103,7 @@ def find_junctions(
     alike = math.cos(0.7 * spec.apart)
     three = nearest_three(feet(x, y, walls), alike)
 
-    def round(start: tuple[Array, Array, Array, Array], _: None):
+    def pursue(start: tuple[Array, Array, Array, Array], _: None):
         x, y, three, found = start
         circle = touch(x, y, three, walls, swaps=3)
         away = jnp.hypot(circle.x - x, circle.y - y)
@@ -117,7 +117,7 @@ def find_junctions(
         three = jnp.where(swapped, thrice(some.fourth)[None], jnp.repeat(some.three, 3, axis=1))
         return (thrice(some.x), thrice(some.y), three, thrice(found)), (circle, worth)
 
-    _, (circle, worth) = lax.scan(round, (x, y, three, found), length=2)
+    _, (circle, worth) = lax.scan(pursue, (x, y, three, found), length=2)
     both = jax.tree.map(lambda x: jnp.concatenate([x[0], x[1]], axis=-1), circle)
     at = jnp.stack([both.x, both.y], axis=1)
     first, found = _first(worth.reshape(-1), at, spec.distinct, 2 * spec.nodes)

@@ -193,9 +193,9 @@ def _hidden(x: Array, y: Array, radius: Array, runs: Runs, thick: float) -> Arra
     sx, sy = ex / away, ey / away
     behind = jnp.clip((x[None] - ex) * sx + (y[None] - ey) * sy, 0.0, thick)
     gx, gy = ex + behind * sx - x[None], ey + behind * sy - y[None]
-    nearest = jnp.sqrt(jnp.maximum(gx * gx + gy * gy, 1e-12))
+    away = jnp.sqrt(jnp.maximum(gx * gx + gy * gy, 1e-12))
     counts = (runs.sharp & runs.valid[:, None]).reshape(-1, 1)
-    return jnp.max(jnp.where(counts, radius[None] - nearest, 0.0), axis=0)
+    return jnp.max(jnp.where(counts, radius[None] - away, 0.0), axis=0)
 
 
 def fit(start: Touching, runs: Runs, *, within: float, thick: float) -> Circles:

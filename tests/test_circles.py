@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rooms import CENTRE, IN_TRIANGLE, LEG, RADIUS, TRIANGLE
 from scipy.optimize import least_squares
 
 from jaxslam import circles, edges, lidar, world
@@ -13,11 +14,7 @@ from jaxslam.world import World
 
 CONFIG = Config()
 LIDAR, SPEC = CONFIG.lidar, CONFIG.nodes
-LEG = 3 * np.sqrt(3)  # [m] height of a triangle with sides of 6 m
-TRIANGLE = world.polyline([(0, 0), (LEG, -3), (LEG, 3), (0, 0)])
-CENTRE, RADIUS = np.array([2 * LEG / 3, 0.0]), LEG / 3
-POSE = np.array([1.5, 0.3, 0.05])
-HERE = to_robot(jnp.array(POSE), jnp.array(CENTRE))
+HERE = to_robot(jnp.array(IN_TRIANGLE), jnp.array(CENTRE))
 ALL_AROUND = Lidar(beams=721, first=-np.pi)
 SQUARE = world.outline([(0.0, 0.0, 2.0, 2.0)])
 ROOM = world.outline([(0.0, 0.0, 2.3, 2.0)])  # its junctions are 0.3 m apart
@@ -158,12 +155,12 @@ def scan_of(walls, pose, scanner=LIDAR):
 
 
 def noisy():
-    return lidar.disturb(jax.random.key(0), scan_of(TRIANGLE, POSE), LIDAR)
+    return lidar.disturb(jax.random.key(0), scan_of(TRIANGLE, IN_TRIANGLE), LIDAR)
 
 
 def test_the_incircle_of_a_triangle_is_exact_from_any_start():
     for off in ([0.0, 0.0], [0.15, -0.1], [-0.1, 0.2]):
-        found = circle(scan_of(TRIANGLE, POSE), HERE + jnp.array(off))
+        found = circle(scan_of(TRIANGLE, IN_TRIANGLE), HERE + jnp.array(off))
         np.testing.assert_allclose(found.centre, HERE, atol=1e-6)
         np.testing.assert_allclose(found.radius, RADIUS, atol=1e-6)
         assert found.touched.sum() == 3 and found.real and abs(found.depth) < 1e-6
@@ -171,9 +168,9 @@ def test_the_incircle_of_a_triangle_is_exact_from_any_start():
 
 def test_a_wall_may_reach_into_a_circle_behind_its_end_by_its_thickness():
     """A plate ends 3 cm outside the circle; behind it, on the line of sight, lies the circle."""
-    tip = lambda turn, away: POSE[:2] + away * np.array([np.cos(turn), np.sin(turn)])
+    tip = lambda turn, away: IN_TRIANGLE[:2] + away * np.array([np.cos(turn), np.sin(turn)])
     plate = world.polyline([tip(0.85, 0.5), tip(1.25, 0.5)])
-    open_room, screened = (scan_of(walls, POSE) for walls in (TRIANGLE, [*TRIANGLE, *plate]))
+    open_room, screened = (scan_of(walls, IN_TRIANGLE) for walls in (TRIANGLE, [*TRIANGLE, *plate]))
     assert circle(open_room, HERE).hidden == 0.0
     behind = [np.hypot(*(tip(0.85, 0.5 + s) - CENTRE)) for s in np.linspace(0, SPEC.thick, 50)]
     assert 0.02 < behind[0] - RADIUS < 0.05 and RADIUS - min(behind) > 0.02
@@ -194,7 +191,7 @@ def shifted(found, draws):
 
 @pytest.mark.parametrize(
     "walls, pose, place, count",
-    [(TRIANGLE, POSE, CENTRE, 3), (SQUARE, (0.8, 0.8, np.pi / 4), (1, 1), 4)],
+    [(TRIANGLE, IN_TRIANGLE, CENTRE, 3), (SQUARE, (0.8, 0.8, np.pi / 4), (1, 1), 4)],
 )
 def test_covariance_of_a_circle_is_that_of_its_lines(walls, pose, place, count):
     """Centres fitted to 2000 draws of the lines; each entry within 5 standard errors."""
@@ -219,7 +216,7 @@ def test_covariance_of_a_circle_is_that_of_its_lines(walls, pose, place, count):
 def test_covariance_of_a_circle_is_that_of_noisy_scans():
     """But for the roughness of walls, which these are without."""
     samples = 400
-    scan = scan_of(TRIANGLE, POSE)
+    scan = scan_of(TRIANGLE, IN_TRIANGLE)
     one = lambda key: circle(lidar.disturb(key, scan, LIDAR), HERE)
     found = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(2), samples))
     error = np.asarray(found.centre - HERE[None])

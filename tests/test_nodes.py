@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rooms import CENTRE, IN_TRIANGLE, RADIUS, TRIANGLE
 
 from jaxslam import edges, lidar, nodes, slam, world
 from jaxslam.geometry import compose, to_robot, to_world, wrap_angle, wrap_line
@@ -11,10 +12,6 @@ from jaxslam.world import World
 
 CONFIG = Config()
 LIDAR, SPEC = CONFIG.lidar, CONFIG.nodes
-LEG = 3 * np.sqrt(3)  # [m] height of a triangle with sides of 6 m
-TRIANGLE = world.polyline([(0, 0), (LEG, -3), (LEG, 3), (0, 0)])
-CENTRE, RADIUS = np.array([2 * LEG / 3, 0.0]), LEG / 3
-IN_TRIANGLE = np.array([1.5, 0.3, 0.05])
 BOX = (-1.5, -2.0, 4.0, 3.0)
 SLOPE = 2 / np.tan(np.radians(37))
 SHED = [(0, 0), (5, 0), (5, 3), (5 - SLOPE, 5), (0, 5), (0, 0)]  # one wall at 143 degrees

@@ -2,9 +2,11 @@
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -74,7 +76,7 @@ def scan_of(name: str, lidar: Lidar) -> Scan:
 def look(name: str, mode: str) -> tuple[voronoi.Diagram, np.ndarray]:
     """Diagram of the world `name` as seen from its origin, and its source cells (H, W)."""
     config = slam.Config(labels=mode, grid=GRID)
-    _, diagram, sources = slam.look(config, scan_of(name, config.lidar))
+    _, diagram, sources = jax.jit(partial(slam.look, config))(scan_of(name, config.lidar))
     return diagram, np.asarray(sources)
 
 

@@ -88,7 +88,9 @@ class RunSpec(NamedTuple):
     price: float = 20.0  # squared standard deviations that a run must explain to be one
     outlier: float = 16.0  # squared standard deviations that one beam may count
     lanes: int = 16  # runs that are followed together
-    rough: float = 0.002  # [m] by which walls themselves leave a line
+    uneven: float = 0.02  # [m] by which walls step in and out and are still one run
+    grain: float = 0.03  # [m] length of wall over which they do so together
+    rough: float = 0.002  # [m] by which points leave a line whatever their number, in its fit
     corner: float = 0.15  # [m] how far the ends of two runs that meet may be from their corner
 
 
@@ -105,17 +107,19 @@ def jumps(scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
     wide = _size(x - jnp.roll(x, 1), y - jnp.roll(y, 1)) > spec.gap
     twice = 2 * jnp.cos(jnp.asarray(lidar.step, r.dtype))
 
-    def predicted(near: Array, far: Array) -> Array:
+    def astray(far: Array, near: Array, there: Array) -> Array:
         inverse = twice / near - 1.0 / far
         guess = jnp.where(inverse > 0.0, 1.0 / jnp.maximum(inverse, 1e-6), jnp.inf)
-        return guess
+        # A wall that steps in or out does so by the more along a beam, the more it is grazed.
+        slant = _size(near - far, near * lidar.step) / (near * lidar.step)
+        return jnp.abs(guess - there) - 2.0 * spec.uneven * slant
 
     # Beam i from i-1 and i-2, and beam i-1 from i and i+1.
-    later = predicted(jnp.roll(r, 1), jnp.roll(r, 2))
-    earlier = predicted(r, jnp.roll(r, -1))
+    later = astray(jnp.roll(r, 2), jnp.roll(r, 1), r)
+    earlier = astray(jnp.roll(r, -1), r, jnp.roll(r, 1))
     # Two readings of noise s extrapolate with about 2.2 s; a far wall may also bend a little.
     tolerance = 5.0 * lidar.noise + 0.05 * jnp.abs(r - jnp.roll(r, 1))
-    smooth = (jnp.abs(later - r) < tolerance) | (jnp.abs(earlier - jnp.roll(r, 1)) < tolerance)
+    smooth = (later < tolerance) | (earlier < tolerance)
     broken = ~scan.hit | ~jnp.roll(scan.hit, 1) | (wide & ~smooth)
     return broken.at[0].set(True)
 
@@ -149,7 +153,15 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
     jump = jumps(scan, lidar, spec)
     noise = max(lidar.noise, 0.005)
     cut = lines.partition(
-        scan, jump, lidar, noise, price=spec.price, outlier=spec.outlier, lanes=spec.lanes
+        scan,
+        jump,
+        lidar,
+        noise,
+        price=spec.price,
+        outlier=spec.outlier,
+        lanes=spec.lanes,
+        uneven=spec.uneven,
+        grain=spec.grain,
     )
     spans = lines.longest(cut.begins, scan.hit, capacity=capacity)
     fewest = jnp.argmin(spans.size).astype(jnp.int32)

@@ -70,15 +70,18 @@ def partition(
     price: float,
     outlier: float,
     lanes: int,
+    uneven: float,
+    grain: float,
     steep: float = 10.0,
 ) -> Partition:
     """Cut a scan into stretches of straight lines: the cut that costs least.
 
     The cost is the sum of squared residuals of ranges about the line of their stretch, in standard
-    deviations, and a price for each stretch. Beam by beam, every stretch that may still be part of
-    the best cut takes the beam in by one step of recursive least squares: in 1 / r a line is
-    linear. The best cut up to a beam is the best cut up to the beginning of its last stretch, and
-    this; what cannot be better any more makes room for the stretch that begins at the beam.
+    deviations of scanner and wall, and a price for each stretch. Beam by beam, every stretch that
+    may still be part of the best cut takes the beam in by one step of recursive least squares: in
+    1 / r a line is linear. The best cut up to a beam is the best cut up to the beginning of its
+    last stretch, and this; what cannot be better any more makes room for the stretch that begins
+    at the beam.
 
     Args:
         scan: The scan.
@@ -88,6 +91,8 @@ def partition(
         price: Of a stretch.
         outlier: A beam costs no more than this, and then does not move the line.
         lanes: C, stretches that are followed together.
+        uneven: [m] standard deviation by which walls step in and out of their line.
+        grain: [m] length of wall over which they do so together.
         steep: Tangent of the angle of incidence that is one standard deviation beforehand.
 
     References:
@@ -100,6 +105,12 @@ def partition(
     ray = unit(bearings(lidar)).astype(q.dtype)
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
+    def variance(q: Array, near: Array) -> Array:
+        # Of 1 / r, `near` being that of the foot. A grain is hit by grain * q**2 / (step * near)
+        # beams, which say the same thing.
+        wall = near * jnp.maximum(near, grain / lidar.step * q * q)
+        return q * q * ((sigma * q) ** 2 + uneven**2 * wall)
+
     def step(now: tuple[Lanes, Array, Array], beam: tuple):
         old, least, free = now
         index, q, c, s, alone = beam
@@ -107,7 +118,7 @@ def partition(
         cosine, sine = c * hc + s * hs, s * hc - c * hs
         gain_a, gain_b = aa * cosine + ab * sine, ab * cosine + bb * sine
         off = q - a * cosine - b * sine
-        noise = (sigma * q * q) ** 2
+        noise = variance(q, jnp.sqrt(a * a + b * b))
         total = noise + cosine * gain_a + sine * gain_b
         excess = off * off / total
         share = jnp.where(excess < outlier, 1.0 / total, 0.0)
@@ -119,7 +130,8 @@ def partition(
             bb - gain_b * share * gain_b,
         )
         zero = jnp.zeros_like(q)
-        fresh = Lanes(least + price, index, (c, s), (q, zero), (noise, zero, (steep * q) ** 2))
+        wide = variance(q, q), zero, (steep * q) ** 2
+        fresh = Lanes(least + price, index, (c, s), (q, zero), wide)
         goes_on = Lanes(cost, old.first, old.heading, line, cov)
         new = jax.tree.map(lambda x, y: jnp.where(lane == free, x, y), fresh, goes_on)
         best, free = jnp.argmin(new.cost), jnp.argmax(new.cost).astype(jnp.int32)

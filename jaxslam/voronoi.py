@@ -68,9 +68,13 @@ def _next(now: Array, other: Array, *, diagonal: bool, more: bool) -> Array:
     ones around it becomes one of them: it can never be reached, unless `more` neighbours count in
     another step.
     """
-    beside = _beside(now) + (_across(now) if diagonal else ())
-    most = reduce(jnp.maximum, beside)
-    least = reduce(jnp.minimum, (lax.bitcast_convert_type(x, jnp.uint8) for x in beside))
+    bits = lambda cells: (lax.bitcast_convert_type(x, jnp.uint8) for x in cells)
+    beside, across = _beside(now), _across(now) if diagonal else ()
+    most, least = reduce(jnp.maximum, beside), reduce(jnp.minimum, bits(beside))
+    if diagonal:
+        nearer = most >= 0
+        most = jnp.where(nearer, most, reduce(jnp.maximum, across, most))
+        least = jnp.where(nearer, least, reduce(jnp.minimum, bits(across), least))
     if more:
         most = jnp.maximum(most, jnp.int8(EMPTY))
     differ = lax.bitcast_convert_type(least, jnp.int8) - most  # negative where fronts meet
@@ -189,13 +193,16 @@ def gather(labels: Array, fronts: Fronts, *, octagon: bool = False) -> Diagram:
     cells = jnp.pad(fronts.cells, 1, constant_values=SHUT)
     waited, own = jnp.pad(fronts.waited, 1), fronts.waited
     one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
-    union = labels
-    straight = zip(_beside(cells), _beside(waited), [own >= 0] * 4, strict=True)
-    across = zip(_across(cells), _across(waited), [own % 2 == 0] * 4, strict=True)
-    for front, when, passes in (*straight, *(across if octagon else ())):
-        bit = one << jnp.maximum(front, 0).astype(labels.dtype)
-        union |= jnp.where((front >= 0) & (when < own) & passes, bit, none)
-    union = jnp.where(fronts.cells == EMPTY, none, union)
+    bits = jnp.where(cells >= 0, one << jnp.maximum(cells, 0).astype(labels.dtype), none)
+
+    def came(around: Callable[[Array], tuple[Array, Array, Array, Array]]) -> Array:
+        near = zip(around(bits), around(waited), strict=True)
+        return reduce(jnp.bitwise_or, (jnp.where(when < own, bit, none) for bit, when in near))
+
+    union = came(_beside)
+    if octagon:
+        union |= jnp.where((union == 0) & (own % 2 == 0), came(_across), none)
+    union = jnp.where(fronts.cells == EMPTY, none, union | labels)
     return Diagram(labels=union, arrival=jnp.where(union != 0, own.astype(jnp.int32), -1))
 
 
@@ -208,8 +215,9 @@ def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> 
             cells are the sources.
         open: (H, W) bool, the cells that fronts may enter.
         steps: Number of steps; a front advances one cell a step.
-        octagon: Every second step enters the four diagonal neighbours too. Fronts then grow as
-            octagons, which are nearer to circles than the paper's diamonds.
+        octagon: Every second step enters the four diagonal neighbours too, where no front comes
+            from nearer. Fronts then grow as octagons, which are nearer to circles than the paper's
+            diamonds.
 
     Raises:
         ValueError: An argument has another shape or type, or `steps` is negative; while tracing.

@@ -78,8 +78,8 @@ def corridor(
 
 
 def opening() -> np.ndarray:
-    """Fig. 6 (b): 1 m of the right wall opens into an alcove."""
-    return corridor(right=[(2.5, -1.2), (2.5, -2.0), (3.5, -2.0), (3.5, -1.2)])
+    """Fig. 6 (b): 1.6 m of the right wall open into an alcove."""
+    return corridor(right=[(2.2, -1.2), (2.2, -2.0), (3.8, -2.0), (3.8, -1.2)])
 
 
 def column() -> np.ndarray:

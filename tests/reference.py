@@ -42,14 +42,16 @@ def expand(labels, open, steps):
 
 
 def expand_octagons(labels, open, steps):
-    """Steps in turn to the four and the eight neighbours, from all cells of one label."""
+    """Steps in turn to the four and the eight neighbours, the four first, from single labels."""
     cells = np.array(labels)
     arrival = np.where(cells != 0, 0, -1)
     for step in range(1, steps + 1):
         before = cells.copy()
-        around = block if step % 2 == 0 else neighbours
+        single = {c: int(x) for c, x in np.ndenumerate(before) if bits(x) == 1}
         for cell in map(tuple, np.argwhere(open & (before == 0))):
-            near = {int(before[c]) for c in around(cell, cells.shape) if bits(before[c]) == 1}
+            near = {single[c] for c in neighbours(cell, cells.shape) if c in single}
+            if not near and step % 2 == 0:
+                near = {single[c] for c in block(cell, cells.shape) if c in single}
             if near:
                 cells[cell], arrival[cell] = sum(near), step
     return cells, arrival

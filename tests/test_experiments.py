@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from experiments import fig02_expansion
+from experiments import fig02_expansion, fig06_local
 
 
 def test_figure_2_is_written_and_equals_the_paper(tmp_path, monkeypatch):
@@ -28,3 +28,12 @@ def test_the_folder_for_the_results_must_be_named(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         fig02_expansion.main()
     assert "--out" in capsys.readouterr().err
+
+
+def test_both_labels_keep_what_the_paper_says_of_corridors():
+    """Figure 6: lines in the middle, the bend, the shift, and no false branch."""
+    told = fig06_local.compute()["claims"]
+    assert set(told) == {"runs", "codes"}
+    for mode, of_mode in told.items():
+        assert {type(x) for x in of_mode.values()} == {bool, float}
+        assert all(x for x in of_mode.values() if isinstance(x, bool)), (mode, of_mode)

@@ -20,7 +20,7 @@ from jaxslam.lidar import Lidar
 TOLERATED = 0.05
 """Part of the ODOM and FLASER lines that may be broken: they are left out and counted."""
 
-NOISE = 0.03
+NOISE = 0.02
 """Standard deviation [m] of a range; the logs do not say it."""
 
 _FORMS = {

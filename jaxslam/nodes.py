@@ -35,7 +35,7 @@ class NodeSpec(NamedTuple):
     least: float = 0.35  # [m] smallest clearance of a node
     most: float = 3.2  # [m] largest
     distinct: float = 0.15  # [m] nodes nearer to each other than this are one
-    apart: float = 0.75  # [rad] three feet of a trusted node differ by this, seen from it
+    apart: float = 0.6  # [rad] three feet of a trusted node differ by this, seen from it
     seen: float = 0.9  # part of the circle of a trusted node that was seen
     thick: float = 0.25  # [m] of walls, as far as they may hide themselves
     hidden: float = 0.02  # [m] by which such may reach into the circle of a trusted node

@@ -18,7 +18,7 @@ ROOM = 0.35  # [m] from a viewpoint to the nearest wall
 BEAMS = 5  # on each wall of a visible corner
 RIM = np.linspace(-np.pi, np.pi, 36, endpoint=False)
 POINTS = 5  # that stand for a side of a cell
-DISTINCT = 0.6  # [rad] as `truth.DISTINCT`, for walls with steps: one cell at 0.6 m is less
+DISTINCT = 0.4  # [rad] as `truth.DISTINCT`, for walls with steps; less than trusted nodes ask
 SPECK, GAP = 0.1, 0.5  # [m] as `jaxslam map` has them: things no wider are noise
 
 

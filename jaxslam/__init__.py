@@ -3,7 +3,7 @@
 from importlib import metadata as _metadata
 
 from jaxslam import ekf, lidar, metrics, monte_carlo, plan, slam, topomap, world
-from jaxslam.ekf import Belief
+from jaxslam.belief import Belief
 from jaxslam.grid import GridSpec
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.motion import Robot

@@ -1,4 +1,4 @@
-"""EKF-SLAM as pure functions: predict, innovations, update, augment, forget.
+"""EKF-SLAM as pure functions: predict, innovations, update, augment.
 
 The state is the robot's pose and two numbers a landmark slot: the position of a node or corner,
 or the direction of a wall (and a zero). The algebra is structured: a prediction touches three
@@ -16,39 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.association import claim_slots
+from jaxslam.belief import Belief
 from jaxslam.geometry import compose, range_bearing, rotation, to_world, wrap_angle, wrap_line
 from jaxslam.nodes import Nodes
 from jaxslam.types import CORNER, NODE, WALL, Array
-
-
-class Belief(NamedTuple):
-    """Gaussian belief over pose and landmarks, D = 3 + 2 L, and the life of each landmark."""
-
-    mean: Array  # (D,) pose [m, m, rad], then the slots
-    cov: Array  # (D, D)
-    seen: Array  # (L,) int32 how often the landmark was seen; 0 marks a free slot
-    last: Array  # (L,) int32 step it was last seen
-    kind: Array  # (L,) int32
-    id: Array  # (L,) int32, never reused
-    direction: Array  # (L,) [rad] world frame, of a corner's free side
-    shape: Array  # (L,) clearance [m] of a node, angle of the free side [rad] of a corner
-    step: Array  # () int32
-    next_id: Array  # () int32
-
-    @property
-    def pose(self) -> Array:
-        """Mean pose (3,), world frame."""
-        return self.mean[..., :3]
-
-    @property
-    def pose_cov(self) -> Array:
-        """Covariance (3, 3) of the pose."""
-        return self.cov[..., :3, :3]
-
-    @property
-    def places(self) -> Array:
-        """Slots (L, 2) of the mean."""
-        return self.mean[..., 3:].reshape(self.mean.shape[:-1] + (-1, 2))
 
 
 class Innovations(NamedTuple):
@@ -59,25 +30,6 @@ class Innovations(NamedTuple):
     by_slot: Array  # (M, 2, 2) and by the landmark's two numbers
     noise: Array  # (M, 2, 2) covariance of the observation; identity where unmatched
     slot: Array  # (M,) int32, L where unmatched
-
-
-def initial(pose: Array, *, landmarks: int) -> Belief:
-    """Belief of a robot that knows its pose (3,) and no landmark."""
-    size = 3 + 2 * landmarks
-    dtype = jnp.result_type(pose)
-    whole = jnp.zeros(landmarks, jnp.int32)
-    return Belief(
-        mean=jnp.zeros(size, dtype).at[:3].set(pose),
-        cov=jnp.zeros((size, size), dtype),
-        seen=whole,
-        last=whole,
-        kind=whole,
-        id=whole,
-        direction=jnp.zeros(landmarks, dtype),
-        shape=jnp.zeros(landmarks, dtype),
-        step=jnp.zeros((), jnp.int32),
-        next_id=jnp.zeros((), jnp.int32),
-    )
 
 
 def predict(belief: Belief, motion: Array, noise: Array) -> Belief:
@@ -268,17 +220,8 @@ def update(belief: Belief, seen: Innovations) -> tuple[Belief, Array, Array]:
     return belief._replace(mean=mean, cov=cov - y.T @ y), v @ v, logdet
 
 
-def note(belief: Belief, nodes: Nodes, slot: Array) -> Belief:
-    """Count the sighting of the matched slots (M,); L is nowhere."""
-    return belief._replace(
-        seen=belief.seen.at[slot].add(1, mode="drop"),
-        last=belief.last.at[slot].set(belief.step, mode="drop"),
-        shape=belief.shape.at[slot].set(nodes.shape, mode="drop"),
-    )
-
-
 def augment(
-    belief: Belief, nodes: Nodes, noise: Array, wanted: Array, *, most: int
+    belief: Belief, nodes: Nodes, noise: Array, wanted: Array, *, most: int, at: Array | None = None
 ) -> tuple[Belief, Array]:
     """Take features in as new landmarks, correlated with all the state as they should be.
 
@@ -290,6 +233,8 @@ def augment(
         noise: (M, 2, 2) their covariance in range and bearing, or in direction and 0.
         wanted: (M,) bool, features to take in.
         most: How many at most; the first come first.
+        at: (M,) int32 slot that each is to get, which is its id too; by default the first that
+            are free, and the next ids.
 
     Returns:
         The belief, and the slot (M,) that each feature got, L for none.
@@ -297,7 +242,10 @@ def augment(
     size = belief.seen.size
     # Put the wanted features first, so that a few rows suffice.
     order = jnp.argsort(~wanted, stable=True)[:most]
-    slot = claim_slots(belief.seen == 0, wanted[order])
+    if at is None:
+        slot = claim_slots(belief.seen == 0, wanted[order])
+    else:
+        slot = jnp.where(wanted, at, size)[order]
     xy, kind, direction = nodes.xy[order], nodes.kind[order], nodes.direction[order]
     is_wall = (kind == WALL)[:, None]
     pose = belief.pose
@@ -321,33 +269,29 @@ def augment(
     index = jnp.arange(most)
     own = jnp.einsum("mij,mjk,mlk->mil", by_seen, noise[order], by_seen)
     among = among.at[index, :, index].add(own)  # (F, 2, F, 2)
-    at = jnp.where(slot < size, 3 + 2 * slot, 3 + 2 * size)
-    at = jnp.stack([at, jnp.minimum(at + 1, 3 + 2 * size)], axis=-1).reshape(-1)
-    rows = rows.reshape(2 * most, -1).at[:, at].set(among.reshape(2 * most, -1), mode="drop")
-    cov = belief.cov.at[at].set(rows, mode="drop").at[:, at].set(rows.T, mode="drop")
-    mean = belief.mean.at[at].set(jnp.where(is_wall, wall, place).reshape(-1), mode="drop")
+    row = jnp.where(slot < size, 3 + 2 * slot, 3 + 2 * size)
+    row = jnp.stack([row, jnp.minimum(row + 1, 3 + 2 * size)], axis=-1).reshape(-1)
+    rows = rows.reshape(2 * most, -1).at[:, row].set(among.reshape(2 * most, -1), mode="drop")
+    cov = belief.cov.at[row].set(rows, mode="drop").at[:, row].set(rows.T, mode="drop")
+    mean = belief.mean.at[row].set(jnp.where(is_wall, wall, place).reshape(-1), mode="drop")
 
     def put(field: Array, value: Array) -> Array:
         return field.at[slot].set(value.astype(field.dtype), mode="drop")
 
     taken = slot < size
+    number = belief.next_id + jnp.cumsum(taken, dtype=jnp.int32) - 1 if at is None else slot
     belief = belief._replace(
         mean=mean,
         cov=cov,
         seen=put(belief.seen, jnp.ones_like(slot)),
         last=put(belief.last, jnp.broadcast_to(belief.step, slot.shape)),
         kind=put(belief.kind, kind),
-        id=put(belief.id, belief.next_id + jnp.cumsum(taken, dtype=jnp.int32) - 1),
+        id=put(belief.id, number),
         direction=put(belief.direction, wrap_angle(direction + pose[2])),
         shape=put(belief.shape, nodes.shape[order]),
         next_id=belief.next_id + jnp.sum(taken, dtype=jnp.int32),
     )
     return belief, jnp.full(wanted.shape, size, jnp.int32).at[order].set(slot)
-
-
-def forget(belief: Belief, gone: Array) -> Belief:
-    """Free the slots (L,) bool; what they held is overwritten when they are used again."""
-    return belief._replace(seen=jnp.where(gone, 0, belief.seen))
 
 
 def alike(belief: Belief, nodes: Nodes, *, shape: float, turn: float) -> Array:

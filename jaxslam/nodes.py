@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.edges import Runs
-from jaxslam.geometry import cross, dot, wrap_angle, wrap_line
-from jaxslam.types import CORNER, WALL, Array
+from jaxslam.geometry import cross, dot, unit, wrap_angle, wrap_line
+from jaxslam.types import CORNER, NODE, WALL, Array, expect
 
 
 class Nodes(NamedTuple):
@@ -123,6 +123,38 @@ def find_walls(runs: Runs, spec: NodeSpec) -> Nodes:
             degree=jnp.zeros(spec.walls, jnp.int32),
             certified=jnp.ones(spec.walls, bool),
             trusted=valid,
+            valid=valid,
+        )
+    )
+
+
+def from_polar(polar: Array, valid: Array) -> Nodes:
+    """Features of a sensor that itself tells range and bearing of landmarks.
+
+    Their own covariance is zero: what the filter assumes of range and bearing is all.
+
+    Args:
+        polar: (M, 2) range [m] and bearing [rad].
+        valid: (M,) bool, False marks padding.
+
+    Raises:
+        ValueError: An argument has another shape or type; while tracing.
+    """
+    expect("polar", polar, ("M", 2), jnp.floating)
+    expect("valid", valid, polar.shape[:1], jnp.bool_)
+    count = valid.size
+    zero, none = jnp.zeros(count, polar.dtype), jnp.zeros(count, bool)
+    return blank(
+        Nodes(
+            kind=jnp.full(count, NODE, jnp.int32),
+            xy=polar[:, :1] * unit(polar[:, 1]),
+            cov=jnp.zeros((count, 2, 2), polar.dtype),
+            direction=zero,
+            variance=zero,
+            shape=zero + 1.0,
+            degree=jnp.zeros(count, jnp.int32),
+            certified=none,
+            trusted=none,
             valid=valid,
         )
     )

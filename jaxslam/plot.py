@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
-from jaxslam.ekf import Belief
+from jaxslam.belief import Belief
 from jaxslam.grid import GridSpec
 from jaxslam.io.occupancy import Occupancy
 from jaxslam.nodes import Nodes

@@ -13,14 +13,14 @@ import numpy as np
 from jax import lax
 
 from jaxslam import association, edges, ekf, junctions, links, nodes, topomap, voronoi
+from jaxslam.belief import Belief, forget, initial, note
 from jaxslam.edges import RunSpec
-from jaxslam.ekf import Belief
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.links import Links
 from jaxslam.motion import Robot, process_noise, wheel_coefficients
 from jaxslam.nodes import Nodes, NodeSpec
-from jaxslam.types import CORNER, NODE, WALL, Array
+from jaxslam.types import CORNER, NODE, WALL, Array, expect
 
 BATCH = 16  # scans that are looked at together
 
@@ -83,6 +83,7 @@ class Inputs(NamedTuple):
 
     motion: Array  # (3,) odometry since the scan before
     nodes: Nodes  # features of this scan
+    known: Array | None = None  # (M,) int32 landmark 0..L-1 each feature is, -1 unknown; or match
 
 
 class Info(NamedTuple):
@@ -147,7 +148,7 @@ def local_map(config: Config, scan: Scan) -> tuple[Nodes, Links]:
 
 def init(config: Config, pose: Array) -> Belief:
     """Belief of a robot that starts at a known pose (3,) with an empty map."""
-    return ekf.initial(pose, landmarks=config.landmarks)
+    return initial(pose, landmarks=config.landmarks)
 
 
 def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
@@ -180,10 +181,46 @@ def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Ar
     return nodes.trusted & (slot == belief.seen.size) & ~jnp.any(same & near, axis=1)
 
 
+class Recognised(NamedTuple):
+    """What the features of a scan are."""
+
+    slot: Array  # (M,) int32 landmark, L for none
+    counts: Array  # (M,) bool, it has been seen often enough to update the state
+    new: Array  # (M,) bool, to be taken in
+    at: Array | None  # (M,) int32 slot that each is to get then; None: any
+
+
+def _recognise(config: Config, belief: Belief, nodes: Nodes, noise: Array) -> Recognised:
+    """Match features to landmarks by their distance and what they look like."""
+    distance = lax.stop_gradient(ekf.distances(belief, nodes, noise))
+    possible = ekf.alike(belief, nodes, shape=config.alike_shape, turn=config.alike_turn)
+    slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
+    sightings = belief.seen.at[slot].get(mode="fill", fill_value=0) + 1
+    counts = sightings >= needed(config, nodes.kind)
+    return Recognised(slot, counts, _new(config, belief, nodes, distance, slot), None)
+
+
+def _identify(belief: Belief, nodes: Nodes, known: Array) -> Recognised:
+    """Take features for the landmarks they are said to be; of several that are one, the first."""
+    expect("inputs.known", known, nodes.kind.shape, jnp.int32)
+    size = belief.seen.size
+    given = nodes.valid & (known >= 0) & (known < size)
+    same = (known[:, None] == known[None]) & given[None]
+    given &= ~jnp.any(jnp.tril(same, -1), axis=1)
+    at = jnp.where(given, known, size)
+    old = belief.seen.at[at].get(mode="fill", fill_value=0) > 0
+    return Recognised(jnp.where(old, at, size), old, given & ~old, at)
+
+
 def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[Belief, Info]:
     """Predict by odometry, match, update, take in new landmarks.
 
-    Matches are integers: derivatives are those of the filter with its matches held fixed.
+    Matches are integers: derivatives are those of the filter with its matches held fixed. With
+    `inputs.known` nothing is matched, and all landmarks count from their first sighting for ever.
+    No more than `config.matches` features update the state in a step, and `config.fresh` are new.
+
+    Raises:
+        ValueError: `inputs.known` has another shape or type than the features; while tracing.
     """
     size = belief.seen.size
     allowed = jnp.isin(inputs.nodes.kind, jnp.array(config.kinds, jnp.int32))
@@ -192,12 +229,12 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     before = ekf.predict(belief, inputs.motion, q)._replace(step=belief.step + 1)
     r = sensor_noise(noise, seen)
 
-    distance = lax.stop_gradient(ekf.distances(before, seen, r))
-    possible = ekf.alike(before, seen, shape=config.alike_shape, turn=config.alike_turn)
-    slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
-    sightings = before.seen.at[slot].get(mode="fill", fill_value=0) + 1
-    counts = sightings >= needed(config, seen.kind)
-    used = (slot < size) & counts
+    if inputs.known is None:
+        features = _recognise(config, before, seen, r)
+    else:
+        features = _identify(before, seen, inputs.known)
+    slot = features.slot
+    used = (slot < size) & features.counts
     # A few rows suffice: wall directions first, then as the front end ordered them.
     urgency = jnp.where(used, jnp.where(seen.kind == WALL, 2, 1), 0)
     order = jnp.argsort(-urgency, stable=True)[: config.matches]
@@ -209,12 +246,13 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
 
     slot, used = jnp.where(finite, slot, size), used & finite
-    after = ekf.note(after, seen, slot)
-    unconfirmed = after.seen < needed(config, after.kind)
-    stale = unconfirmed & (after.step - after.last > config.patience)
-    after = ekf.forget(after, stale)
-    wanted = _new(config, before, seen, distance, slot) & finite
-    after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh)
+    after = note(after, seen, slot)
+    if inputs.known is None:
+        unconfirmed = after.seen < needed(config, after.kind)
+        stale = unconfirmed & (after.step - after.last > config.patience)
+        after = forget(after, stale)
+    wanted = features.new & finite
+    after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh, at=features.at)
 
     slot = jnp.minimum(slot, fresh)
     rank = jnp.where(seen.kind == WALL, 1, 2)

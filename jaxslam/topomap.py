@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxslam import ways
 from jaxslam.association import claim_slots
-from jaxslam.ekf import Belief
+from jaxslam.belief import Belief
 from jaxslam.geometry import to_robot, to_world, unit
 from jaxslam.lidar import Lidar, Scan, before_ends
 from jaxslam.links import LINE, TWIN, Links, gap, repeated

@@ -8,6 +8,7 @@ import reference_filter
 from reference_filter import DenseSlam
 
 from jaxslam import ekf
+from jaxslam.belief import forget, initial
 from jaxslam.nodes import Nodes
 from jaxslam.types import CORNER, NODE, WALL
 
@@ -80,7 +81,7 @@ def random_belief(seed, *, landmarks=4):
     # A direction has one number; the other is a certain zero.
     for slot in np.flatnonzero(KINDS[:landmarks] == WALL):
         root[4 + 2 * slot] = 0.0
-    blank = ekf.initial(jnp.array(mean[:3]), landmarks=L)
+    blank = initial(jnp.array(mean[:3]), landmarks=L)
     return blank._replace(
         mean=blank.mean.at[:used].set(mean),
         cov=blank.cov.at[:used, :used].set(root @ root.T),
@@ -109,7 +110,7 @@ def observed(rng, pose, index):
 def test_twenty_steps_equal_dense_ekf_slam(seed):
     rng = np.random.default_rng(seed)
     pose, motion = np.array([0.0, 0.0, 2.9]), np.array([0.3, 0.02, 0.15])
-    belief, dense = ekf.initial(jnp.array(pose), landmarks=L), DenseSlam(pose)
+    belief, dense = initial(jnp.array(pose), landmarks=L), DenseSlam(pose)
     slot_of, order = {}, []
     for _ in range(20):
         pose = reference_filter.compose(pose, motion + rng.multivariate_normal(np.zeros(3), Q))
@@ -182,7 +183,7 @@ def test_predict_and_update_equal_filterpy():
 def test_heading_and_wall_directions_are_a_linear_kalman_filter():
     rng = np.random.default_rng(1)
     walls, q, r = np.array([0.3, -0.4]), 0.02**2, WALL_STD**2
-    belief = ekf.initial(jnp.array([1.0, 2.0, 0.1]), landmarks=L)
+    belief = initial(jnp.array([1.0, 2.0, 0.1]), landmarks=L)
     nodes, noise = features([WALL, WALL], np.array([[0.2, 0], [-0.5, 0]]))
     belief, _ = enlarged(belief, nodes, noise, nodes.valid)
     mean, cov = np.array([0.1, 0.3, -0.4]), np.diag([0.0, r, r])
@@ -299,7 +300,7 @@ def test_a_new_landmark_has_the_moments_of_samples():
     samples, rng = 200_000, np.random.default_rng(0)
     pose, small = np.array([0.3, -0.2, 0.7]), 0.02
     root = small * rng.normal(size=(3, 3))
-    belief = ekf.initial(jnp.array(pose), landmarks=L)
+    belief = initial(jnp.array(pose), landmarks=L)
     belief = belief._replace(cov=belief.cov.at[:3, :3].set(root @ root.T))
     nodes, r = features([NODE], [[4.0, 0.6]])
     after, slot = enlarged(belief, nodes, r, nodes.valid)
@@ -331,7 +332,7 @@ def test_augment_leaves_the_rest_of_the_belief_alone_and_counts_ids():
 def test_a_slot_that_is_used_again_keeps_nothing_of_its_past():
     belief = random_belief(0)
     nodes, r = features([NODE], [[2.0, 0.4]])
-    freed = ekf.forget(belief, jnp.arange(L) == 1)
+    freed = forget(belief, jnp.arange(L) == 1)
     blank = freed._replace(
         mean=freed.mean.at[5:7].set(0.0), cov=freed.cov.at[5:7].set(0.0).at[:, 5:7].set(0.0)
     )
@@ -368,7 +369,7 @@ def test_covariance_stays_symmetric_and_positive_definite_in_float32():
             first, _ = ekf.augment(first, *earliest, jnp.ones(M, bool), most=M)
             return jax.lax.scan(body, first, now)[1]
 
-        out = whole(ekf.initial(jnp.zeros(3, dtype), landmarks=M), (nodes, r))
+        out = whole(initial(jnp.zeros(3, dtype), landmarks=M), (nodes, r))
         assert out[0].dtype == dtype
         return jax.tree.map(np.asarray, out)
 

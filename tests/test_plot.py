@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 
-from jaxslam import ekf, plot, slam
+from jaxslam import plot, slam
+from jaxslam.belief import initial
 from jaxslam.topomap import Graph
 from jaxslam.types import CORNER, NODE, WALL
 from jaxslam.world import World, named
@@ -20,7 +21,7 @@ def of_type(axis, kind):
 
 def belief():
     """Two landmarks that count, a node and a corner; a wall, and a node seen once."""
-    start = ekf.initial(jnp.zeros(3), landmarks=4)
+    start = initial(jnp.zeros(3), landmarks=4)
     return start._replace(
         mean=start.mean.at[3:].set(jnp.array([1.0, 2.0, 3.0, 4.0, 0.5, 0.0, 9.0, 9.0])),
         cov=jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.04, 0.01, 0.01, 0.09, 1.0, 1.0, 1.0, 1.0])),
@@ -78,7 +79,7 @@ def test_an_empty_map_draws_nothing(axis):
     none = Graph(*(np.zeros(shape) for shape in ((0,), (0, 2), (0,), (0,))),
                  np.zeros((0, 2), int), np.zeros(0), np.zeros(0), ())  # fmt: skip
     plot.arcs(axis, none)
-    plot.landmarks(axis, ekf.initial(jnp.zeros(3), landmarks=4), confirm=2)
+    plot.landmarks(axis, initial(jnp.zeros(3), landmarks=4), confirm=2)
     axis.figure.draw_without_rendering()
 
 

@@ -8,7 +8,8 @@ import networkx
 import numpy as np
 import pytest
 
-from jaxslam import ekf, topomap, ways
+from jaxslam import topomap, ways
+from jaxslam.belief import initial
 from jaxslam.geometry import compose, to_robot, to_world
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.links import LINE, Links
@@ -78,7 +79,7 @@ def arcs_of(*found):
 def belief_of(xy, kind, seen, id=None, shape=None):
     """Belief with landmarks in known states."""
     size = len(kind)
-    belief = ekf.initial(HERE, landmarks=size)
+    belief = initial(HERE, landmarks=size)
     return belief._replace(
         mean=belief.mean.at[3:].set(jnp.array(xy, float).reshape(-1)),
         kind=jnp.array(kind, jnp.int32),
@@ -346,7 +347,7 @@ def test_a_slot_used_again_does_not_inherit_arcs():
 
 
 def test_an_empty_map_has_shapes():
-    graph = graph_of(ekf.initial(HERE, landmarks=5), topomap.empty(arcs=12))
+    graph = graph_of(initial(HERE, landmarks=5), topomap.empty(arcs=12))
     assert [x.shape for x in graph[:7]] == [(0,), (0, 2), (0,), (0,), (0, 2), (0,), (0,)]
     assert graph.lines == graph.frontiers == () and graph.frontier_of.shape == (0,)
     assert graph.pairs.dtype.kind == "i"

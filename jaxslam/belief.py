@@ -1,0 +1,71 @@
+"""The belief of EKF-SLAM: a Gaussian over pose and landmarks, and the life of each landmark."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxslam.nodes import Nodes
+from jaxslam.types import Array
+
+
+class Belief(NamedTuple):
+    """Gaussian belief over pose and landmarks, D = 3 + 2 L, and the life of each landmark."""
+
+    mean: Array  # (D,) pose [m, m, rad], then the slots
+    cov: Array  # (D, D)
+    seen: Array  # (L,) int32 how often the landmark was seen; 0 marks a free slot
+    last: Array  # (L,) int32 step it was last seen
+    kind: Array  # (L,) int32
+    id: Array  # (L,) int32, never reused
+    direction: Array  # (L,) [rad] world frame, of a corner's free side
+    shape: Array  # (L,) clearance [m] of a node, angle of the free side [rad] of a corner
+    step: Array  # () int32
+    next_id: Array  # () int32
+
+    @property
+    def pose(self) -> Array:
+        """Mean pose (3,), world frame."""
+        return self.mean[..., :3]
+
+    @property
+    def pose_cov(self) -> Array:
+        """Covariance (3, 3) of the pose."""
+        return self.cov[..., :3, :3]
+
+    @property
+    def places(self) -> Array:
+        """Slots (L, 2) of the mean."""
+        return self.mean[..., 3:].reshape(self.mean.shape[:-1] + (-1, 2))
+
+
+def initial(pose: Array, *, landmarks: int) -> Belief:
+    """Belief of a robot that knows its pose (3,) and no landmark."""
+    size = 3 + 2 * landmarks
+    dtype = jnp.result_type(pose)
+    whole = jnp.zeros(landmarks, jnp.int32)
+    return Belief(
+        mean=jnp.zeros(size, dtype).at[:3].set(pose),
+        cov=jnp.zeros((size, size), dtype),
+        seen=whole,
+        last=whole,
+        kind=whole,
+        id=whole,
+        direction=jnp.zeros(landmarks, dtype),
+        shape=jnp.zeros(landmarks, dtype),
+        step=jnp.zeros((), jnp.int32),
+        next_id=jnp.zeros((), jnp.int32),
+    )
+
+
+def note(belief: Belief, nodes: Nodes, slot: Array) -> Belief:
+    """Count the sighting of the matched slots (M,); L is nowhere."""
+    return belief._replace(
+        seen=belief.seen.at[slot].add(1, mode="drop"),
+        last=belief.last.at[slot].set(belief.step, mode="drop"),
+        shape=belief.shape.at[slot].set(nodes.shape, mode="drop"),
+    )
+
+
+def forget(belief: Belief, gone: Array) -> Belief:
+    """Free the slots (L,) bool; what they held is overwritten when they are used again."""
+    return belief._replace(seen=jnp.where(gone, 0, belief.seen))

@@ -1,0 +1,124 @@
+"""The filter with known association: a sensor that tells which landmark it sees."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference_filter
+from reference_filter import DenseSlam
+
+from jaxslam import motion, nodes, slam
+from jaxslam.slam import Config, Inputs
+from jaxslam.types import NODE
+
+T, M, L = 80, 5, 12
+CONFIG = Config(landmarks=L, matches=M, fresh=M)
+NOISE = slam.wheel_noise(motion.Robot())._replace(range=jnp.array(0.1), bearing=jnp.array(0.03))
+R = np.diag([0.1, 0.03]) ** 2
+MOTION = np.array([0.25, 0.0, 0.07])
+Q = np.asarray(motion.process_noise(NOISE.odometry, jnp.array(MOTION)))
+
+
+def drive(seed):
+    """True poses (T, 3), motions (T, 3), range and bearing (T, M, 2) and who it is (T, M), or -1.
+
+    The nearest landmarks within 5 m, in any order, padded.
+    """
+    rng = np.random.default_rng(seed)
+    places = rng.uniform([-5.0, -2.0], [5.0, 9.0], (L, 2))
+    pose, poses = np.zeros(3), []
+    polar, who = np.zeros((T, M, 2)), np.full((T, M), -1, np.int32)
+    for t in range(T):
+        if t:
+            pose = reference_filter.compose(pose, rng.multivariate_normal(MOTION, Q))
+        poses.append(pose)
+        away = np.hypot(*(places - pose[:2]).T)
+        near = rng.permutation(np.argsort(away)[: np.sum(away < 5.0)][: M - t % 2])
+        slot = rng.permutation(M)[: len(near)]
+        state = np.concatenate([pose, places.ravel()])
+        for k, i in zip(slot, near, strict=True):
+            seen, _ = reference_filter.observe(state, i, NODE)
+            polar[t, k], who[t, k] = seen + rng.normal(size=2) * [0.1, 0.03], i
+    told = np.where(np.arange(T)[:, None] > 0, MOTION, 0.0)
+    return np.stack(poses), told, polar, who
+
+
+def inputs(told, polar, who):
+    seen = jax.vmap(nodes.from_polar)(jnp.asarray(polar), jnp.asarray(who >= 0))
+    return Inputs(jnp.asarray(told), seen, jnp.asarray(who))
+
+
+def run(told, config=CONFIG):
+    return slam.run(config, NOISE, slam.init(config, jnp.zeros(3)), told)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_equals_dense_ekf_slam(seed):
+    poses, told, polar, who = drive(seed)
+    belief, info = run(inputs(told, polar, who))
+    dense, order = DenseSlam(np.zeros(3)), []
+    for t in range(T):
+        dense.predict(told[t], Q if t else np.zeros((3, 3)))
+        old = [k for k in range(M) if who[t, k] in order]
+        if old:
+            nis, logdet = dense.update(
+                [(order.index(who[t, k]), NODE, polar[t, k], R) for k in old]
+            )
+            density = nis + logdet + 2 * len(old) * np.log(2 * np.pi)
+            np.testing.assert_allclose(info.nis[t], nis, atol=1e-8)
+            np.testing.assert_allclose(info.log_likelihood[t], -0.5 * density, atol=1e-8)
+        for k in range(M):
+            if who[t, k] >= 0 and k not in old:
+                dense.augment(NODE, polar[t, k], R)
+                order.append(who[t, k])
+        np.testing.assert_allclose(info.pose[t], dense.mean[:3], atol=1e-9)
+        np.testing.assert_allclose(info.pose_cov[t], dense.cov[:3, :3], atol=1e-10)
+    rows = np.concatenate([np.arange(3), *[3 + 2 * i + np.arange(2) for i in order]])
+    np.testing.assert_allclose(belief.mean[rows], dense.mean, atol=1e-9)
+    np.testing.assert_allclose(belief.cov[np.ix_(rows, rows)], dense.cov, atol=1e-10)
+    np.testing.assert_array_equal(info.slot, np.where(who >= 0, who, L))
+    np.testing.assert_array_equal(info.id, who)
+    assert len(order) >= 9 and np.hypot(*(info.pose[-1] - poses[-1])[:2]) < 0.5
+
+
+def test_a_landmark_told_twice_in_a_scan_counts_once():
+    _, told, polar, who = drive(0)
+    doubled = np.concatenate([polar, polar[:, :1] + 0.2], axis=1)
+    name = np.concatenate([who, who[:, :1]], axis=1)
+    config = CONFIG._replace(matches=M + 1, fresh=M + 1)
+    once, twice = run(inputs(told, polar, who)), run(inputs(told, doubled, name), config)
+    np.testing.assert_allclose(once[0].mean, twice[0].mean, atol=1e-12)
+    np.testing.assert_array_equal(once[0].seen, twice[0].seen)
+
+
+def test_features_without_a_known_landmark_are_invisible_in_values_and_gradients():
+    _, told, polar, who = drive(1)
+    junk = np.concatenate([polar, np.tile([[[2.0, 0.3], [3.0, 0.1]]], (T, 1, 1))], axis=1)
+    extra = np.tile(np.array([[-1, L]], np.int32), (T, 1))
+
+    @jax.value_and_grad
+    def loss(noise, told):
+        _, info = slam.run(CONFIG, noise, slam.init(CONFIG, jnp.zeros(3)), told)
+        return jnp.sum(info.pose[:, :2] ** 2)
+
+    told_junk = inputs(told, junk, np.concatenate([who, extra], axis=1))
+    told_junk = told_junk._replace(
+        nodes=told_junk.nodes._replace(valid=told_junk.nodes.valid.at[:, M:].set(True))
+    )
+    plain, with_junk = loss(NOISE, inputs(told, polar, who)), loss(NOISE, told_junk)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), plain, with_junk
+    )
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(plain))
+    assert np.abs(plain[1].range) > 0 and np.abs(plain[1].bearing) > 0
+
+
+def test_wrong_shapes_are_told():
+    _, told, polar, who = drive(0)
+    good = inputs(told, polar, who)
+    with pytest.raises(ValueError, match=r"inputs.known is int32 \(4,\), not"):
+        run(good._replace(known=good.known[:, :4]))
+    with pytest.raises(ValueError, match=r"polar is .*\(5, 3\), not"):
+        nodes.from_polar(jnp.zeros((5, 3)), jnp.zeros(5, bool))
+    with pytest.raises(ValueError, match="valid is .*, not"):
+        nodes.from_polar(jnp.zeros((5, 2)), jnp.zeros(4, bool))

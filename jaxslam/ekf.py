@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from jaxslam.association import claim_slots
 from jaxslam.belief import Belief
@@ -169,23 +168,21 @@ def innovations(belief: Belief, nodes: Nodes, noise: Array, slot: Array) -> Inno
 def whiten(s: Array, b: Array) -> tuple[Array, Array]:
     """Return L^-1 b (n, k) and log det S () of S = L L^T (n, n), for b (n, k).
 
-    Forward elimination of [S, b], one row a step, in array operations alone: programs that call
-    LAPACK can hang when several run at once on the threads of one CPU.
+    Forward elimination of [S, b] in array operations alone: programs that call LAPACK can hang when
+    several run at once on the threads of one CPU. Unrolled, what is left gets smaller with each
+    row, and stays where it is: a scan over the rows takes five times as long.
     """
     n = s.shape[0]
-    index = jnp.arange(n)
-
-    def eliminate(left: Array, k: Array) -> tuple[Array, tuple[Array, Array]]:
-        row = lax.dynamic_index_in_dim(left, k, keepdims=False)
-        pivot = lax.dynamic_index_in_dim(row, k, keepdims=False)
+    left, white, logs = jnp.concatenate([s, b], axis=1), [], []
+    for k in range(n):
+        pivot = left[0, 0]
         # S is positive definite; if rounding or nonsense made it otherwise, say so with NaN.
-        row = row / jnp.sqrt(jnp.where(pivot > 0.0, pivot, jnp.nan))
+        row = left[0] / jnp.sqrt(jnp.where(pivot > 0.0, pivot, jnp.nan))
         # The column below the pivot is the row to its right: S stays symmetric.
-        factor = jnp.where(index > k, row[:n], 0.0)
-        return left - factor[:, None] * row[None, :], (row[n:], jnp.log(pivot))
-
-    _, (white, logs) = lax.scan(eliminate, jnp.concatenate([s, b], axis=1), index)
-    return white, jnp.sum(logs)
+        left = left[1:, 1:] - row[1 : n - k, None] * row[None, 1:]
+        white.append(row[n - k :])
+        logs.append(jnp.log(pivot))
+    return jnp.stack(white), sum(logs)
 
 
 def update(belief: Belief, seen: Innovations) -> tuple[Belief, Array, Array]:

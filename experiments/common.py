@@ -73,10 +73,16 @@ def scan_of(name: str, lidar: Lidar) -> Scan:
     return cast(world.World(walls), jnp.zeros(3), lidar)
 
 
+@partial(jax.jit, static_argnums=0)
+def _diagram(config: slam.Config, scan: Scan) -> tuple[voronoi.Diagram, jnp.ndarray]:
+    """Diagram and source cells of a scan; the landmarks are not even compiled."""
+    return slam.look(config, scan)[1:]
+
+
 def look(name: str, mode: str) -> tuple[voronoi.Diagram, np.ndarray]:
     """Diagram of the world `name` as seen from its origin, and its source cells (H, W)."""
     config = slam.Config(labels=mode, grid=GRID)
-    _, diagram, sources = jax.jit(partial(slam.look, config))(scan_of(name, config.lidar))
+    diagram, sources = _diagram(config, scan_of(name, config.lidar))
     return diagram, np.asarray(sources)
 
 

@@ -185,7 +185,6 @@ class Recognised(NamedTuple):
     """What the features of a scan are."""
 
     slot: Array  # (M,) int32 landmark, L for none
-    counts: Array  # (M,) bool, it has been seen often enough to update the state
     new: Array  # (M,) bool, to be taken in
     at: Array | None  # (M,) int32 slot that each is to get then; None: any
 
@@ -195,9 +194,7 @@ def _recognise(config: Config, belief: Belief, nodes: Nodes, noise: Array) -> Re
     distance = lax.stop_gradient(ekf.distances(belief, nodes, noise))
     possible = ekf.alike(belief, nodes, shape=config.alike_shape, turn=config.alike_turn)
     slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
-    sightings = belief.seen.at[slot].get(mode="fill", fill_value=0) + 1
-    counts = sightings >= needed(config, nodes.kind)
-    return Recognised(slot, counts, _new(config, belief, nodes, distance, slot), None)
+    return Recognised(slot, _new(config, belief, nodes, distance, slot), None)
 
 
 def _identify(belief: Belief, nodes: Nodes, known: Array) -> Recognised:
@@ -209,7 +206,7 @@ def _identify(belief: Belief, nodes: Nodes, known: Array) -> Recognised:
     given &= ~jnp.any(jnp.tril(same, -1), axis=1)
     at = jnp.where(given, known, size)
     old = belief.seen.at[at].get(mode="fill", fill_value=0) > 0
-    return Recognised(jnp.where(old, at, size), old, given & ~old, at)
+    return Recognised(jnp.where(old, at, size), given & ~old, at)
 
 
 def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[Belief, Info]:
@@ -233,8 +230,10 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
         features = _recognise(config, before, seen, r)
     else:
         features = _identify(before, seen, inputs.known)
+        config = config._replace(confirm=1, wall_confirm=1)  # it counts at once, and for ever
     slot = features.slot
-    used = (slot < size) & features.counts
+    sightings = before.seen.at[slot].get(mode="fill", fill_value=0) + 1
+    used = (slot < size) & (sightings >= needed(config, seen.kind))
     # A few rows suffice: wall directions first, then as the front end ordered them.
     urgency = jnp.where(used, jnp.where(seen.kind == WALL, 2, 1), 0)
     order = jnp.argsort(-urgency, stable=True)[: config.matches]
@@ -247,10 +246,9 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
 
     slot, used = jnp.where(finite, slot, size), used & finite
     after = note(after, seen, slot)
-    if inputs.known is None:
-        unconfirmed = after.seen < needed(config, after.kind)
-        stale = unconfirmed & (after.step - after.last > config.patience)
-        after = forget(after, stale)
+    unconfirmed = after.seen < needed(config, after.kind)
+    stale = unconfirmed & (after.step - after.last > config.patience)
+    after = forget(after, stale)
     wanted = features.new & finite
     after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh, at=features.at)
 

@@ -9,10 +9,16 @@ from jaxslam.types import Array
 
 
 class Belief(NamedTuple):
-    """Gaussian belief over pose and landmarks, D = 3 + 2 L, and the life of each landmark."""
+    """Gaussian belief over pose and landmarks, D = 3 + 2 L, and the life of each landmark.
+
+    The covariance is kept in blocks: a motion changes the first two only.
+    """
 
     mean: Array  # (D,) pose [m, m, rad], then the slots
-    cov: Array  # (D, D)
+    anchor: Array  # (D,) pose as last predicted, slots as first estimated
+    pose_cov: Array  # (3, 3)
+    cross_cov: Array  # (3, 2 L) of pose and slots
+    map_cov: Array  # (2 L, 2 L)
     seen: Array  # (L,) int32 how often the landmark was seen; 0 marks a free slot
     last: Array  # (L,) int32 step it was last seen
     kind: Array  # (L,) int32
@@ -28,9 +34,11 @@ class Belief(NamedTuple):
         return self.mean[..., :3]
 
     @property
-    def pose_cov(self) -> Array:
-        """Covariance (3, 3) of the pose."""
-        return self.cov[..., :3, :3]
+    def cov(self) -> Array:
+        """Covariance (D, D) of pose and slots, put together."""
+        top = jnp.concatenate([self.pose_cov, self.cross_cov], axis=-1)
+        low = jnp.concatenate([jnp.swapaxes(self.cross_cov, -1, -2), self.map_cov], axis=-1)
+        return jnp.concatenate([top, low], axis=-2)
 
     @property
     def places(self) -> Array:
@@ -43,9 +51,13 @@ def initial(pose: Array, *, landmarks: int) -> Belief:
     size = 3 + 2 * landmarks
     dtype = jnp.result_type(pose)
     whole = jnp.zeros(landmarks, jnp.int32)
+    mean = jnp.zeros(size, dtype).at[:3].set(pose)
     return Belief(
-        mean=jnp.zeros(size, dtype).at[:3].set(pose),
-        cov=jnp.zeros((size, size), dtype),
+        mean=mean,
+        anchor=mean,
+        pose_cov=jnp.zeros((3, 3), dtype),
+        cross_cov=jnp.zeros((3, size - 3), dtype),
+        map_cov=jnp.zeros((size - 3, size - 3), dtype),
         seen=whole,
         last=whole,
         kind=whole,

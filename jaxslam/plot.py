@@ -133,7 +133,7 @@ def ellipses(axis: Axes, xy: np.ndarray, cov: np.ndarray, color: str) -> None:
 def landmarks(axis: Axes, belief: Belief, *, confirm: int) -> None:
     """Draw nodes and corners of a belief that were seen `confirm` times, with their covariance."""
     seen, kind = np.asarray(belief.seen), np.asarray(belief.kind)
-    place, cov = np.asarray(belief.places), np.asarray(belief.cov)[3:, 3:]
+    place, cov = np.asarray(belief.places), np.asarray(belief.map_cov)
     size, index = len(seen), np.arange(len(seen))
     own = cov.reshape(size, 2, size, 2)[index, :, index]
     for which in MARKS:

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import association, edges, ekf, junctions, links, nodes, topomap, voronoi
+from jaxslam import association, edges, ekf, junctions, links, nodes, sensor, topomap, voronoi
 from jaxslam.belief import Belief, forget, initial, note
 from jaxslam.edges import RunSpec
+from jaxslam.geometry import to_world, wrap_line
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.links import Links
@@ -53,6 +54,7 @@ class Config(NamedTuple):
     labels: str = "runs"  # or "codes", the paper's
     kinds: tuple[int, ...] = (NODE, CORNER, WALL)  # landmarks the filter uses
     steps: int = 32  # of the automaton
+    linearisation: str = "standard"  # the paper's, or another of `ekf.LINEARISATIONS`
     landmarks: int = 96  # L
     matches: int = 8  # landmarks that update the state in one scan at most
     fresh: int = 4  # new landmarks in one scan at most
@@ -153,7 +155,7 @@ def init(config: Config, pose: Array) -> Belief:
 
 def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
     """Covariance (M, 2, 2) of the features in range and bearing, or in direction (and 0)."""
-    own = jax.vmap(ekf.polar_cov)(nodes.xy, nodes.cov)
+    own = jax.vmap(sensor.polar_cov)(nodes.xy, nodes.cov)
     floor = jnp.diag(jnp.stack([noise.range, noise.bearing]) ** 2)
     point = noise.scale**2 * own + floor[None]
     wall = noise.scale**2 * nodes.variance + noise.wall**2
@@ -170,11 +172,9 @@ def needed(config: Config, kind: Array) -> Array:
 def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Array) -> Array:
     """Trusted features (M,) bool that are far from all landmarks of their kind."""
     same = (nodes.kind[:, None] == belief.kind[None]) & (belief.seen > 0)[None]
-    place = ekf.to_world(belief.pose, nodes.xy)
+    place = to_world(belief.pose, nodes.xy)
     gap = jnp.linalg.norm(place[:, None] - belief.places[None], axis=2)
-    turn = jnp.abs(
-        ekf.wrap_line(nodes.direction[:, None] + belief.pose[2] - belief.places[None, :, 0])
-    )
+    turn = jnp.abs(wrap_line(nodes.direction[:, None] + belief.pose[2] - belief.places[None, :, 0]))
     is_wall = (nodes.kind == WALL)[:, None]
     near = jnp.where(is_wall, turn < config.wall_apart, gap < config.apart)
     near |= ~is_wall & (distance < config.far)
@@ -223,7 +223,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     allowed = jnp.isin(inputs.nodes.kind, jnp.array(config.kinds, jnp.int32))
     seen = nodes.restrict(inputs.nodes, allowed)
     q = process_noise(noise.odometry, inputs.motion)
-    before = ekf.predict(belief, inputs.motion, q)._replace(step=belief.step + 1)
+    how = {"linearisation": config.linearisation}
+    before = ekf.predict(belief, inputs.motion, q, **how)._replace(step=belief.step + 1)
     r = sensor_noise(noise, seen)
 
     if inputs.known is None:
@@ -239,9 +240,10 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     order = jnp.argsort(-urgency, stable=True)[: config.matches]
     used &= jnp.zeros_like(used).at[order].set(True)
     some = jax.tree.map(lambda x: x[order], (seen, r, jnp.where(used, slot, size)))
-    rows = ekf.innovations(before, *some)
-    after, nis, logdet = ekf.update(before, rows)
-    finite = jnp.all(jnp.isfinite(after.mean)) & jnp.isfinite(nis)
+    rows = ekf.innovations(before, *some, **how)
+    after, done = ekf.update(before, rows, **how)
+    nis, logdet = done.nis, done.logdet
+    finite = jnp.all(jnp.isfinite(after.mean)) & jnp.isfinite(nis) & done.good
     after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
 
     slot, used = jnp.where(finite, slot, size), used & finite
@@ -250,7 +252,7 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     stale = unconfirmed & (after.step - after.last > config.patience)
     after = forget(after, stale)
     wanted = features.new & finite
-    after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh, at=features.at)
+    after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh, at=features.at, **how)
 
     slot = jnp.minimum(slot, fresh)
     rank = jnp.where(seen.kind == WALL, 1, 2)
@@ -278,7 +280,6 @@ def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Be
     beliefs only.
     """
 
-    @jax.checkpoint
     def body(belief: Belief, now: Inputs) -> tuple[Belief, Info]:
         return step(config, noise, belief, now)
 

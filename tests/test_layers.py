@@ -7,9 +7,9 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 ORDER = (
-    "types geometry world motion lidar grid voronoi tiles lines edges global_edges circles nodes "
-    "junctions links alignment association belief ekf ways topomap medial skeleton slam plan "
-    "metrics monte_carlo fit io plot report cli"
+    "types linalg geometry world motion lidar grid voronoi tiles lines edges global_edges circles "
+    "nodes sensor junctions links alignment association belief conditioning ekf ways topomap "
+    "medial skeleton slam plan metrics monte_carlo fit io plot report cli"
 ).split()
 DOORS = {"__init__", "__main__"}  # may import everything
 FILES = sorted(HOME.rglob("*.py"))

@@ -24,7 +24,7 @@ def belief():
     start = initial(jnp.zeros(3), landmarks=4)
     return start._replace(
         mean=start.mean.at[3:].set(jnp.array([1.0, 2.0, 3.0, 4.0, 0.5, 0.0, 9.0, 9.0])),
-        cov=jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.04, 0.01, 0.01, 0.09, 1.0, 1.0, 1.0, 1.0])),
+        map_cov=jnp.diag(jnp.array([0.04, 0.01, 0.01, 0.09, 1.0, 1.0, 1.0, 1.0])),
         seen=jnp.array([3, 2, 9, 1]),
         kind=jnp.array([NODE, CORNER, WALL, NODE]),
     )

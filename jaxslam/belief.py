@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxslam.nodes import Nodes
-from jaxslam.types import Array
+from jaxslam.types import NODE, Array, expect, expect_covariance
 
 
 class Belief(NamedTuple):
@@ -46,16 +46,28 @@ class Belief(NamedTuple):
         return self.mean[..., 3:].reshape(self.mean.shape[:-1] + (-1, 2))
 
 
-def initial(pose: Array, *, landmarks: int) -> Belief:
-    """Belief of a robot that knows its pose (3,) and no landmark."""
+def initial(pose: Array, *, landmarks: int, cov: Array | None = None) -> Belief:
+    """Belief of a robot that knows its pose (3,) and no landmark.
+
+    Args:
+        pose: World frame.
+        landmarks: L, slots of the map.
+        cov: (3, 3) covariance of the pose; zero by default, as the map has no other origin.
+
+    Raises:
+        ValueError: The covariance is not symmetric and positive semi-definite.
+    """
     size = 3 + 2 * landmarks
     dtype = jnp.result_type(pose)
+    if cov is not None:
+        expect("cov", cov, (3, 3), jnp.floating)
+        expect_covariance("cov", cov, definite=False)
     whole = jnp.zeros(landmarks, jnp.int32)
     mean = jnp.zeros(size, dtype).at[:3].set(pose)
     return Belief(
         mean=mean,
         anchor=mean,
-        pose_cov=jnp.zeros((3, 3), dtype),
+        pose_cov=jnp.zeros((3, 3), dtype) if cov is None else jnp.asarray(cov, dtype),
         cross_cov=jnp.zeros((3, size - 3), dtype),
         map_cov=jnp.zeros((size - 3, size - 3), dtype),
         seen=whole,
@@ -66,6 +78,38 @@ def initial(pose: Array, *, landmarks: int) -> Belief:
         shape=jnp.zeros(landmarks, dtype),
         step=jnp.zeros((), jnp.int32),
         next_id=jnp.zeros((), jnp.int32),
+    )
+
+
+def know(belief: Belief, places: Array, cov: Array, kind: int = NODE) -> Belief:
+    """Give an empty map landmarks that are known beforehand, in the first slots.
+
+    Args:
+        belief: Without landmarks.
+        places: (K, 2) where they are, world frame; K <= L.
+        cov: (K, 2, 2) their covariances.
+        kind: What they are, `NODE` or `CORNER`.
+
+    Raises:
+        ValueError: A covariance is not symmetric and positive definite, or shapes do not fit.
+    """
+    expect("places", places, ("K", 2), jnp.floating)
+    count, size = places.shape[0], belief.seen.size
+    expect("cov", cov, (count, 2, 2), jnp.floating)
+    expect_covariance("cov", cov)
+    if count > size:
+        raise ValueError(f"{count} places for a map of {size} landmarks")
+    index = jnp.arange(count, dtype=jnp.int32)
+    mean = belief.mean.at[3 : 3 + 2 * count].set(places.reshape(-1))
+    blocks = belief.map_cov.reshape(size, 2, size, 2).at[index, :, index].set(cov)
+    return belief._replace(
+        mean=mean,
+        anchor=mean,
+        map_cov=blocks.reshape(belief.map_cov.shape),
+        seen=belief.seen.at[:count].set(1),
+        kind=belief.kind.at[:count].set(kind),
+        id=belief.id.at[:count].set(index),
+        next_id=jnp.maximum(belief.next_id, jnp.int32(count)),
     )
 
 

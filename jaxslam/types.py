@@ -49,3 +49,35 @@ def expect(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> None:
         wanted += "," if len(shape) == 1 else ""
         of = "" if kind is None else f"{np.dtype(kind) if kind is jnp.bool_ else kind.__name__} "
         raise ValueError(f"{name} is {dtype} {sizes}, not {of}({wanted})")
+
+
+def expect_covariance(name: str, cov: Array, *, definite: bool = True) -> None:
+    """Raise ValueError unless `cov` (..., n, n) is finite, symmetric and positive definite.
+
+    While tracing there are no values to look at, and nothing is checked.
+
+    Args:
+        name: Of `cov`, for the message.
+        cov: The matrices.
+        definite: False lets semi-definite ones pass: something known for certain.
+
+    Raises:
+        ValueError: One is not; the message tells which, and why.
+    """
+    if isinstance(cov, jax.core.Tracer):
+        return
+    all = np.asarray(cov, float)
+    for index in np.ndindex(all.shape[:-2]):
+        one, where = all[index], name + (str(list(index)) if index else "")
+        if not np.isfinite(one).all():
+            raise ValueError(f"{where} holds numbers that are not finite")
+        scale = np.abs(one).max()
+        if np.abs(one - one.T).max() > 1e-5 * scale:
+            i, j = np.unravel_index(np.argmax(np.abs(one - one.T)), one.shape)
+            raise ValueError(
+                f"{where} is not symmetric: [{i}, {j}] is {one[i, j]:g}, [{j}, {i}] {one[j, i]:g}"
+            )
+        least = np.linalg.eigvalsh((one + one.T) / 2)[0]
+        if not (least > 0.0 if definite else least >= -1e-6 * scale):
+            wanted = "positive definite" if definite else "positive semi-definite"
+            raise ValueError(f"{where} is not {wanted}: its least eigenvalue is {least:g}")

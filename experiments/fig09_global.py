@@ -25,11 +25,14 @@ from jaxslam.grid import centres
 from jaxslam.lidar import cast, disturb
 from jaxslam.motion import Robot, process_noise, wheel_coefficients
 from jaxslam.nodes import NodeSpec
+from jaxslam.recognition import MatchSpec
 from jaxslam.types import NODE
 from jaxslam.voronoi import branches
 
 WORLD = "fig07"
-CONFIG = slam.Config(confirm=1, apart=0.15, nodes=NodeSpec(seen=0.5, hidden=0.3))
+CONFIG = slam.Config(
+    confirm=1, matching=MatchSpec(apart=0.15), nodes=NodeSpec(seen=0.5, hidden=0.3)
+)
 NEAR = 0.1  # [m] a node of the map this close to a junction is that junction
 SHIFT = (0.05, 0.05, 0.05)  # [m, m, rad] standard deviation of places that are moved
 
@@ -90,7 +93,7 @@ def explore(
         arcs = add(arcs, info.id, info.pose, branch, scan, lidar=CONFIG.lidar)
         way.append(np.asarray(info.pose))
         graph = topomap.graph(
-            belief, arcs, np.array(way), confirm=CONFIG.confirm, apart=CONFIG.apart
+            belief, arcs, np.array(way), confirm=CONFIG.confirm, apart=CONFIG.matching.apart
         )
         maps.append(plain_map(graph))
     return maps, np.array(way), (scans, seen, links)

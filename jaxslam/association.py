@@ -30,15 +30,19 @@ def match(distance: Array, possible: Array, *, gate: float, margin: float) -> Ar
     return jnp.where((nearest < gate) & clear & mutual, best, l).astype(jnp.int32)
 
 
-def claim_slots(free: Array, wanted: Array) -> Array:
+def claim_slots(worth: Array, wanted: Array) -> Array:
     """Slot (M,) int32 for each feature that wants one, in order; L, nowhere, for all others.
 
     Args:
-        free: (L,) bool, slots that may be taken.
+        worth: (L,) what is lost with each slot; the least go first, infinite ones never.
         wanted: (M,) bool.
     """
-    free_first = jnp.argsort(~free, stable=True)
-    rank = jnp.cumsum(wanted) - 1
-    fits = wanted & (rank < jnp.sum(free))
-    slot = free_first[jnp.clip(rank, 0, free.size - 1)]
-    return jnp.where(fits, slot, free.size).astype(jnp.int32)
+    l = worth.size
+    index = jnp.arange(l, dtype=jnp.int32)
+    before = (worth[:, None] < worth[None]) | (
+        (worth[:, None] == worth[None]) & (index[:, None] < index[None])
+    )
+    place = jnp.sum(before, axis=0, dtype=jnp.int32)  # in the order of worth
+    turn = jnp.where(wanted, jnp.cumsum(wanted, dtype=jnp.int32) - 1, l)
+    mine = (turn[:, None] == place[None]) & (worth < jnp.inf)[None]
+    return jnp.where(jnp.any(mine, axis=1), jnp.argmax(mine, axis=1), l).astype(jnp.int32)

@@ -21,6 +21,8 @@ class Belief(NamedTuple):
     map_cov: Array  # (2 L, 2 L)
     seen: Array  # (L,) int32 how often the landmark was seen; 0 marks a free slot
     last: Array  # (L,) int32 step it was last seen
+    missed: Array  # (L,) int32 steps in a row that it should have been seen and was not
+    looks: Array  # (L,) int32 times in a row that it was met again and not yet believed
     kind: Array  # (L,) int32
     id: Array  # (L,) int32, never reused
     direction: Array  # (L,) [rad] world frame, of a corner's free side
@@ -72,6 +74,8 @@ def initial(pose: Array, *, landmarks: int, cov: Array | None = None) -> Belief:
         map_cov=jnp.zeros((size - 3, size - 3), dtype),
         seen=whole,
         last=whole,
+        missed=whole,
+        looks=whole,
         kind=whole,
         id=whole,
         direction=jnp.zeros(landmarks, dtype),
@@ -118,8 +122,27 @@ def note(belief: Belief, nodes: Nodes, slot: Array) -> Belief:
     return belief._replace(
         seen=belief.seen.at[slot].add(1, mode="drop"),
         last=belief.last.at[slot].set(belief.step, mode="drop"),
+        missed=belief.missed.at[slot].set(0, mode="drop"),
         shape=belief.shape.at[slot].set(nodes.shape, mode="drop"),
     )
+
+
+def worth(belief: Belief, confirmed: Array, *, idle: int) -> Array:
+    """What is lost with each slot (L,): nothing with free ones, all with confirmed landmarks.
+
+    A candidate may go when it was not seen for more than `idle` steps: the least seen first, then
+    the longest unseen.
+
+    Args:
+        belief: Belief.
+        confirmed: (L,) bool, landmarks that count.
+        idle: Steps.
+    """
+    age = belief.step - belief.last
+    real = lambda x: x.astype(belief.mean.dtype)
+    value = real(belief.seen) + 1.0 - real(age) / real(1 + jnp.maximum(belief.step, age))
+    value = jnp.where(confirmed | (age <= idle), jnp.inf, value)
+    return jnp.where(belief.seen == 0, 0.0, value)
 
 
 def forget(belief: Belief, gone: Array) -> Belief:

@@ -39,7 +39,7 @@ class Conditioned(NamedTuple):
     cov: Blocks
     nis: Array  # () squared Mahalanobis norm of the residuals
     logdet: Array  # () logarithm of the determinant of their covariance S
-    good: Array  # () bool, S is positive definite; else nothing was changed
+    good: Array  # () bool, S is positive definite, all is finite; else nothing was changed
 
 
 class _Kept(NamedTuple):
@@ -70,7 +70,7 @@ def condition(cov: Blocks, rows: Rows) -> Conditioned:
         S = H P H^T + R,   A S A^T = I,   Y = A H P,   P' = P - Y^T Y,   shift = Y^T A v
 
     P stays symmetric by construction, and no inverse is taken. Where S is not positive definite,
-    by rounding or nonsense, nothing is changed.
+    by rounding or nonsense, or a residual is not finite, nothing is changed.
 
     Derivatives are taken in reverse only, by hand: `_pull`. They take `cov` for symmetric.
 
@@ -93,11 +93,12 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     index = jnp.arange(rows.slot.size)
     s = s.reshape(-1, 2, n // 2, 2).at[index, :, index].add(rows.noise).reshape(n, n)
     root, logdet, good = inverse_root(s)
-    root = lax.optimization_barrier(root)
+    w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
+    good &= jnp.all(jnp.isfinite(w))
+    root, w = lax.optimization_barrier((jnp.where(good, root, 0.0), jnp.where(good, w, 0.0)))
     y_pose = add_products(jnp.zeros_like(hp), root.T, hp)
     y_map = add_products(jnp.zeros_like(hm), root.T, hm)
-    w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
-    y_pose, y_map, w = lax.optimization_barrier((y_pose, y_map, w))
+    y_pose, y_map = lax.optimization_barrier((y_pose, y_map))
     after = Blocks(
         pose=add_products(cov.pose, y_pose, y_pose, sign=-1),
         cross=add_products(cov.cross, y_pose, y_map, sign=-1),

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.association import claim_slots
-from jaxslam.belief import Belief
+from jaxslam.belief import Belief, forget
 from jaxslam.conditioning import Blocks, Conditioned, Rows, condition
 from jaxslam.geometry import compose, rotation, to_world, wrap_angle, wrap_line
-from jaxslam.linalg import add_products
+from jaxslam.linalg import add_products, inverse_root
 from jaxslam.nodes import Nodes
 from jaxslam.sensor import expect, observation, residual
-from jaxslam.types import CORNER, NODE, WALL, Array
+from jaxslam.types import WALL, Array
 
 LINEARISATIONS = ("standard", "first_estimates", "invariant")
 
@@ -66,33 +66,6 @@ def predict(
         pose_cov=pose_cov + turn @ noise @ turn.T,
         cross_cov=belief.cross_cov.at[:2].add(lever[:, None] * belief.cross_cov[2:]),
     )
-
-
-def distances(belief: Belief, nodes: Nodes, noise: Array) -> Array:
-    """Squared Mahalanobis distance (M, L) of every feature to every slot.
-
-    Args:
-        belief: Predicted belief.
-        nodes: Features of the scan.
-        noise: (M, 2, 2) their covariance.
-    """
-    size = belief.seen.size
-    expected, by_pose, by_slot = jax.vmap(expect, in_axes=(None, 0, 0))(
-        belief.pose, belief.places, belief.kind
-    )
-    across = belief.cross_cov.reshape(3, size, 2).transpose(1, 0, 2)  # (L, 3, 2)
-    index = jnp.arange(size)
-    own = belief.map_cov.reshape(size, 2, size, 2)[index, :, index]  # (L, 2, 2)
-    mixed = jnp.einsum("lij,ljk,lmk->lim", by_pose, across, by_slot)
-    spread = jnp.einsum("lij,jk,lmk->lim", by_pose, belief.pose_cov, by_pose)
-    spread += mixed + jnp.swapaxes(mixed, 1, 2)
-    spread += jnp.einsum("lij,ljk,lmk->lim", by_slot, own, by_slot)
-    error = residual(observation(nodes)[:, None], expected[None], belief.kind[None])  # (M, L, 2)
-    s = spread[None] + noise[:, None]
-    a, b, d = s[..., 0, 0], 0.5 * (s[..., 0, 1] + s[..., 1, 0]), s[..., 1, 1]
-    determinant = jnp.maximum(a * d - b * b, 1e-12)
-    x, y = error[..., 0], error[..., 1]
-    return (d * x * x - 2 * b * x * y + a * y * y) / determinant
 
 
 def innovations(
@@ -160,6 +133,40 @@ def update(
     return after, done
 
 
+def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Belief:
+    """Condition on two landmarks being one place, and forget the second.
+
+    Args:
+        belief: Updated belief.
+        keep: () int32 slot.
+        drop: () int32 slot to be forgotten; L where there is nothing to merge.
+        std: How well [m] they are one.
+    """
+    size = belief.seen.size
+    found = drop < size
+    pair = jnp.stack([keep, jnp.where(found, drop, keep)])
+    difference = lambda x: x[..., 0, :] - x[..., 1, :]
+    hp = difference(belief.cross_cov.reshape(3, size, 2)[:, pair]).T  # (2, 3)
+    hm = belief.map_cov.reshape(size, 2, -1)[pair]
+    hm = hm[0] - hm[1]  # (2, 2 L)
+    s = difference(hm.reshape(2, size, 2)[:, pair]) + std**2 * jnp.eye(2, dtype=hm.dtype)
+    root, _, good = inverse_root(s)
+    root = jnp.where(found & good, root, 0.0)
+    y_pose, y_map = root @ hp, root @ hm
+    w = -root @ difference(belief.places[pair])
+    mean = belief.mean + jnp.concatenate([w @ y_pose, w @ y_map])
+    gone = found & good & (jnp.arange(size, dtype=jnp.int32) == drop)
+    more = jnp.where(found & good, belief.seen.at[drop].get(mode="fill", fill_value=0), 0)
+    belief = belief._replace(
+        mean=mean.at[2].set(wrap_angle(mean[2])),
+        pose_cov=add_products(belief.pose_cov, y_pose, y_pose, sign=-1),
+        cross_cov=add_products(belief.cross_cov, y_pose, y_map, sign=-1),
+        map_cov=add_products(belief.map_cov, y_map, y_map, sign=-1),
+        seen=belief.seen.at[keep].add(more),
+    )
+    return forget(belief, gone)
+
+
 def _retract(belief: Belief, shift: Array) -> Belief:
     """Move the mean by a shift (D,) along the group SE_{1+L}(2), and the covariance with it.
 
@@ -201,6 +208,7 @@ def augment(
     *,
     most: int,
     at: Array | None = None,
+    worth: Array | None = None,
     linearisation: str = "standard",
 ) -> tuple[Belief, Array]:
     """Take features in as new landmarks, correlated with all the state as they should be.
@@ -213,8 +221,9 @@ def augment(
         noise: (M, 2, 2) their covariance in range and bearing, or in direction and 0.
         wanted: (M,) bool, features to take in.
         most: How many at most; the first come first.
-        at: (M,) int32 slot that each is to get, which is its id too; by default the first that
-            are free, and the next ids.
+        at: (M,) int32 slot that each is to get, which is its id too; by default those of least
+            worth, and the next ids.
+        worth: (L,) what is lost with a slot; by default free ones may be taken, and no others.
         linearisation: One of `LINEARISATIONS`.
 
     Returns:
@@ -228,7 +237,9 @@ def augment(
     # Put the wanted features first, so that a few rows suffice.
     order = jnp.argsort(~wanted, stable=True)[:most]
     if at is None:
-        slot = claim_slots(belief.seen == 0, wanted[order])
+        if worth is None:
+            worth = jnp.where(belief.seen == 0, 0.0, jnp.inf)
+        slot = claim_slots(worth, wanted[order])
     else:
         slot = jnp.where(wanted, at, size)[order]
     xy, kind, direction = nodes.xy[order], nodes.kind[order], nodes.direction[order]
@@ -278,25 +289,10 @@ def augment(
         last=put(belief.last, jnp.broadcast_to(belief.step, slot.shape)),
         kind=put(belief.kind, kind),
         id=put(belief.id, number),
+        missed=put(belief.missed, jnp.zeros_like(slot)),
+        looks=put(belief.looks, jnp.zeros_like(slot)),
         direction=put(belief.direction, wrap_angle(direction + pose[2])),
         shape=put(belief.shape, nodes.shape[order]),
         next_id=belief.next_id + jnp.sum(taken, dtype=jnp.int32),
     )
     return belief, jnp.full(wanted.shape, size, jnp.int32).at[order].set(slot)
-
-
-def alike(belief: Belief, nodes: Nodes, *, shape: float, turn: float) -> Array:
-    """Pairs (M, L) bool of feature and slot that could be one thing, wherever they are.
-
-    Same kind; nodes of like clearance (`shape`, in logarithm), corners of like angle that face
-    like directions (`turn` [rad]).
-    """
-    same = nodes.kind[:, None] == belief.kind[None]
-    same &= (belief.seen > 0)[None] & nodes.valid[:, None]
-    ratio = jnp.maximum(nodes.shape[:, None], 1e-3) / jnp.maximum(belief.shape[None], 1e-3)
-    clearance = jnp.abs(jnp.log(ratio)) < shape
-    facing = wrap_angle(nodes.direction[:, None] + belief.pose[2] - belief.direction[None])
-    opening = nodes.shape[:, None] - belief.shape[None]
-    corner = (jnp.abs(facing) < turn) & (jnp.abs(opening) < turn)
-    kind = nodes.kind[:, None]
-    return same & jnp.where(kind == NODE, clearance, jnp.where(kind == CORNER, corner, True))

@@ -154,7 +154,7 @@ def from_polar(polar: Array, valid: Array) -> Nodes:
             shape=zero + 1.0,
             degree=jnp.zeros(count, jnp.int32),
             certified=none,
-            trusted=none,
+            trusted=valid,
             valid=valid,
         )
     )

@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import association, edges, ekf, junctions, links, nodes, sensor, topomap, voronoi
-from jaxslam.belief import Belief, forget, initial, note
+from jaxslam import edges, ekf, junctions, links, nodes, sensor, topomap, voronoi
+from jaxslam.belief import Belief, forget, initial, note, worth
 from jaxslam.edges import RunSpec
-from jaxslam.geometry import to_world, wrap_line
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.links import Links
 from jaxslam.motion import Robot, process_noise, wheel_coefficients
 from jaxslam.nodes import Nodes, NodeSpec
-from jaxslam.types import CORNER, NODE, WALL, Array, expect
+from jaxslam.recognition import MatchSpec, identify, overdue, recognise, twin
+from jaxslam.types import CORNER, NODE, WALL, Array
 
 BATCH = 16  # scans that are looked at together
 
@@ -57,17 +57,14 @@ class Config(NamedTuple):
     linearisation: str = "standard"  # the paper's, or another of `ekf.LINEARISATIONS`
     landmarks: int = 96  # L
     matches: int = 8  # landmarks that update the state in one scan at most
-    fresh: int = 4  # new landmarks in one scan at most
-    gate: float = 9.21  # chi-square of 2 at 99 %
-    margin: float = 4.0  # squared distance between the best match and the next
-    far: float = 25.0  # squared distance from which a feature may be new
-    apart: float = 0.3  # [m] and distance from the next of its kind
-    wall_apart: float = 0.26  # [rad] likewise between wall directions
-    alike_shape: float = 0.3  # logarithm of the ratio of clearances
-    alike_turn: float = 0.5  # [rad] between directions of corners
+    fresh: int = 8  # new landmarks in one scan at most
+    matching: MatchSpec = MatchSpec()
+    doubt: float = 3.0  # factor on the standard deviation of features that are not trusted
     confirm: int = 2  # sightings from which a landmark counts
     wall_confirm: int = 4  # likewise a wall direction: most scans show one, and a wrong one harms
     patience: int = 40  # steps after which an unconfirmed one is dropped
+    idle: int = 5  # and after which it makes room where the map is full
+    misses: int = 10  # steps in a row in which a node in plain sight was not seen; then it is gone
 
 
 class Noise(NamedTuple):
@@ -100,6 +97,10 @@ class Info(NamedTuple):
     dof: Array  # () int32 and their number
     log_likelihood: Array  # () [nats] of the innovations
     finite: Array  # () bool, False where the update had to be left out
+    fresh: Array  # () int32 features that were taken in as new landmarks
+    forgotten: Array  # () int32 landmarks and candidates that were forgotten
+    evicted: Array  # () int32 candidates that made room for others in a full map
+    merged: Array  # () int32 landmarks that were found to be another
 
 
 def front_end(config: Config, scan: Scan) -> Nodes:
@@ -148,16 +149,32 @@ def local_map(config: Config, scan: Scan) -> tuple[Nodes, Links]:
     return found, joined
 
 
-def init(config: Config, pose: Array) -> Belief:
-    """Belief of a robot that starts at a known pose (3,) with an empty map."""
-    return initial(pose, landmarks=config.landmarks)
+def init(config: Config, pose: Array, cov: Array | None = None) -> Belief:
+    """Belief of a robot that starts at a pose (3,) with an empty map.
+
+    Args:
+        config: Of the filter.
+        pose: World frame.
+        cov: (3, 3) covariance of the pose; zero by default, as the map has no other origin.
+
+    Raises:
+        ValueError: The covariance is not symmetric and positive semi-definite.
+    """
+    return initial(pose, landmarks=config.landmarks, cov=cov)
 
 
-def sensor_noise(noise: Noise, nodes: Nodes) -> Array:
-    """Covariance (M, 2, 2) of the features in range and bearing, or in direction (and 0)."""
+def sensor_noise(noise: Noise, nodes: Nodes, *, doubt: float = 1.0) -> Array:
+    """Covariance (M, 2, 2) of the features in range and bearing, or in direction (and 0).
+
+    Args:
+        noise: What the filter assumes.
+        nodes: Features of a scan.
+        doubt: Factor on the standard deviation of places that are not trusted.
+    """
     own = jax.vmap(sensor.polar_cov)(nodes.xy, nodes.cov)
     floor = jnp.diag(jnp.stack([noise.range, noise.bearing]) ** 2)
-    point = noise.scale**2 * own + floor[None]
+    unsure = jnp.where(nodes.trusted, 1.0, doubt**2).astype(own.dtype)
+    point = (noise.scale**2 * own + floor[None]) * unsure[:, None, None]
     wall = noise.scale**2 * nodes.variance + noise.wall**2
     zero = jnp.zeros_like(wall)
     wall = jnp.stack([jnp.stack([wall, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
@@ -169,44 +186,34 @@ def needed(config: Config, kind: Array) -> Array:
     return jnp.where(kind == WALL, config.wall_confirm, config.confirm)
 
 
-def _new(config: Config, belief: Belief, nodes: Nodes, distance: Array, slot: Array) -> Array:
-    """Trusted features (M,) bool that are far from all landmarks of their kind."""
-    same = (nodes.kind[:, None] == belief.kind[None]) & (belief.seen > 0)[None]
-    place = to_world(belief.pose, nodes.xy)
-    gap = jnp.linalg.norm(place[:, None] - belief.places[None], axis=2)
-    turn = jnp.abs(wrap_line(nodes.direction[:, None] + belief.pose[2] - belief.places[None, :, 0]))
-    is_wall = (nodes.kind == WALL)[:, None]
-    near = jnp.where(is_wall, turn < config.wall_apart, gap < config.apart)
-    near |= ~is_wall & (distance < config.far)
-    return nodes.trusted & (slot == belief.seen.size) & ~jnp.any(same & near, axis=1)
+def _outlive(config: Config, belief: Belief, slot: Array) -> tuple[Belief, Array, Array]:
+    """Forget what is not there, and merge two landmarks that are one.
 
+    Args:
+        config: Of the filter.
+        belief: Updated, sightings noted.
+        slot: (M,) int32 landmarks that updated it, L for none; one of them is looked at, in turn.
 
-class Recognised(NamedTuple):
-    """What the features of a scan are."""
-
-    slot: Array  # (M,) int32 landmark, L for none
-    new: Array  # (M,) bool, to be taken in
-    at: Array | None  # (M,) int32 slot that each is to get then; None: any
-
-
-def _recognise(config: Config, belief: Belief, nodes: Nodes, noise: Array) -> Recognised:
-    """Match features to landmarks by their distance and what they look like."""
-    distance = lax.stop_gradient(ekf.distances(belief, nodes, noise))
-    possible = ekf.alike(belief, nodes, shape=config.alike_shape, turn=config.alike_turn)
-    slot = association.match(distance, possible, gate=config.gate, margin=config.margin)
-    return Recognised(slot, _new(config, belief, nodes, distance, slot), None)
-
-
-def _identify(belief: Belief, nodes: Nodes, known: Array) -> Recognised:
-    """Take features for the landmarks they are said to be; of several that are one, the first."""
-    expect("inputs.known", known, nodes.kind.shape, jnp.int32)
-    size = belief.seen.size
-    given = nodes.valid & (known >= 0) & (known < size)
-    same = (known[:, None] == known[None]) & given[None]
-    given &= ~jnp.any(jnp.tril(same, -1), axis=1)
-    at = jnp.where(given, known, size)
-    old = belief.seen.at[at].get(mode="fill", fill_value=0) > 0
-    return Recognised(jnp.where(old, at, size), given & ~old, at)
+    Returns:
+        The belief, and the numbers () of forgotten and of merged landmarks.
+    """
+    lidar, size = config.lidar, belief.seen.size
+    view = lidar.first, lidar.first + lidar.step * (lidar.beams - 1)
+    due = overdue(belief, view) & (belief.last < belief.step)
+    belief = belief._replace(missed=jnp.where(due, belief.missed + 1, belief.missed))
+    confirmed = belief.seen >= needed(config, belief.kind)
+    gone = ~confirmed & (belief.step - belief.last > config.patience)
+    gone = (gone | (belief.missed >= config.misses)) & (belief.seen > 0)
+    belief = forget(belief, gone)
+    one = slot[belief.step % slot.size]
+    other = twin(config.matching, belief, one)
+    # The older name stays.
+    name = lambda at: belief.id.at[at].get(mode="fill", fill_value=jnp.iinfo(jnp.int32).max)
+    swap = name(other) < name(one)
+    keep, drop = jnp.where(swap, other, one), jnp.where(swap, one, other)
+    merged = (other < size).astype(jnp.int32)
+    belief = ekf.merge(belief, jnp.minimum(keep, size - 1), drop)
+    return belief, jnp.sum(gone, dtype=jnp.int32), merged
 
 
 def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[Belief, Info]:
@@ -225,12 +232,12 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     q = process_noise(noise.odometry, inputs.motion)
     how = {"linearisation": config.linearisation}
     before = ekf.predict(belief, inputs.motion, q, **how)._replace(step=belief.step + 1)
-    r = sensor_noise(noise, seen)
+    r = sensor_noise(noise, seen, doubt=config.doubt)
 
     if inputs.known is None:
-        features = _recognise(config, before, seen, r)
+        features = recognise(config.matching, before, seen, r)
     else:
-        features = _identify(before, seen, inputs.known)
+        features = identify(before, seen, inputs.known)
         config = config._replace(confirm=1, wall_confirm=1)  # it counts at once, and for ever
     slot = features.slot
     sightings = before.seen.at[slot].get(mode="fill", fill_value=0) + 1
@@ -243,16 +250,28 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     rows = ekf.innovations(before, *some, **how)
     after, done = ekf.update(before, rows, **how)
     nis, logdet = done.nis, done.logdet
-    finite = jnp.all(jnp.isfinite(after.mean)) & jnp.isfinite(nis) & done.good
-    after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
-
+    finite = jnp.all(jnp.isfinite(after.mean)) & done.good
+    # A conditioning that fails changes no covariance.
+    after = after._replace(mean=jnp.where(finite, after.mean, before.mean))
     slot, used = jnp.where(finite, slot, size), used & finite
     after = note(after, seen, slot)
-    unconfirmed = after.seen < needed(config, after.kind)
-    stale = unconfirmed & (after.step - after.last > config.patience)
-    after = forget(after, stale)
-    wanted = features.new & finite
-    after, fresh = ekf.augment(after, seen, r, wanted, most=config.fresh, at=features.at, **how)
+    if inputs.known is None:
+        after, forgotten, merged = _outlive(config, after, jnp.where(used, slot, size)[order])
+    else:
+        forgotten = merged = jnp.int32(0)
+    confirmed = after.seen >= needed(config, after.kind)
+    held = after.seen
+    after, fresh = ekf.augment(
+        after,
+        seen,
+        r,
+        features.new & finite,
+        most=config.fresh,
+        at=features.at,
+        worth=worth(after, confirmed, idle=config.idle),
+        **how,
+    )
+    evicted = jnp.sum(held.at[fresh].get(mode="fill", fill_value=0) > 0, dtype=jnp.int32)
 
     slot = jnp.minimum(slot, fresh)
     rank = jnp.where(seen.kind == WALL, 1, 2)
@@ -268,6 +287,10 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
         dof=dof,
         log_likelihood=jnp.where(finite, -0.5 * density, 0.0),
         finite=finite,
+        fresh=jnp.sum(fresh < size, dtype=jnp.int32),
+        forgotten=forgotten,
+        evicted=evicted,
+        merged=merged,
     )
     return after, info
 
@@ -325,15 +348,15 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
         arcs,
         np.asarray(info.pose),
         confirm=config.confirm,
-        apart=config.apart,
-        alike=config.alike_shape,
+        apart=config.matching.apart,
+        alike=config.matching.shape,
     )
     return Survey(belief, info, seen, graph)
 
 
 def wheel_noise(robot: Robot) -> Noise:
     """Noise of a simulated robot: its encoders, and how well the front end finds landmarks."""
-    return _noise(wheel_coefficients(robot), range=0.01, bearing=0.005, scale=1.0, wall=0.0005)
+    return _noise(wheel_coefficients(robot), range=0.002, bearing=0.001, scale=0.85, wall=0.0001)
 
 
 def log_noise() -> Noise:

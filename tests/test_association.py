@@ -61,14 +61,14 @@ def test_an_impossible_pair_is_neither_matched_nor_in_the_way():
     np.testing.assert_array_equal(matched(distance, possible), [1])
 
 
-def test_claimed_slots_are_free_ones_in_order():
-    free = jnp.array([False, True, False, True, True])
-    wanted = jnp.array([True, False, True])
-    np.testing.assert_array_equal(claim_slots(free, wanted), [1, 5, 3])
+def test_claimed_slots_are_those_of_least_worth_in_order():
+    worth = jnp.array([np.inf, 0.0, 3.0, 0.0, 2.0])
+    wanted = jnp.array([True, False, True, True, False, True, True])
+    np.testing.assert_array_equal(claim_slots(worth, wanted), [1, 5, 3, 4, 5, 2, 5])
 
 
 def test_a_full_map_drops_new_landmarks():
-    slots = claim_slots(jnp.array([False, True, False]), jnp.array([True, True]))
+    slots = claim_slots(jnp.array([np.inf, 0.0, np.inf]), jnp.array([True, True]))
     np.testing.assert_array_equal(slots, [1, 3])
     np.testing.assert_array_equal(jnp.zeros(3).at[slots].set(1.0, mode="drop"), [0, 1, 0])
-    np.testing.assert_array_equal(claim_slots(jnp.zeros(3, bool), jnp.ones(2, bool)), [3, 3])
+    np.testing.assert_array_equal(claim_slots(jnp.full(3, jnp.inf), jnp.ones(2, bool)), [3, 3])

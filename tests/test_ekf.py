@@ -7,7 +7,7 @@ import pytest
 import reference_filter
 from reference_filter import DenseSlam
 
-from jaxslam import ekf, sensor
+from jaxslam import ekf, recognition, sensor
 from jaxslam.belief import forget, initial
 from jaxslam.nodes import Nodes
 from jaxslam.types import CORNER, NODE, WALL
@@ -237,7 +237,7 @@ def test_a_landmark_where_the_robot_is_gives_finite_values_and_gradients():
         now = with_cov(belief, cov)._replace(mean=mean)
         now, nis, logdet = conditioned(now, nodes, r, slots(0))
         now, _ = enlarged(now, nodes, r, jnp.arange(M) == 1)
-        distance = ekf.distances(now, nodes, r)[:2, :2]
+        distance = recognition.distances(now, nodes, r)[:2, :2]
         return jnp.sum(now.mean) + jnp.sum(now.cov) + nis + logdet + jnp.sum(distance)
 
     both = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2)))
@@ -248,7 +248,7 @@ def test_a_landmark_where_the_robot_is_gives_finite_values_and_gradients():
 def test_distances_are_the_norms_of_single_updates():
     belief = random_belief(3)
     nodes, r = features(KINDS[:4], [[3.9, 0.2], [-0.3, 0], [4.3, 1.7], [4.0, -1.6]])
-    distance = np.asarray(jax.jit(ekf.distances)(belief, nodes, r))
+    distance = np.asarray(jax.jit(recognition.distances)(belief, nodes, r))
     for n in range(4):
         single = slots(*[n if k == n else L for k in range(4)])
         _, nis, _ = conditioned(belief, nodes, r, single)

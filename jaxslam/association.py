@@ -1,7 +1,10 @@
 """Which feature is which landmark: gates on distances; knows no filter."""
 
 import jax.numpy as jnp
+import numpy as np
+from scipy.special import chdtri
 
+from jaxslam.linalg import add_products, inverse_root
 from jaxslam.types import Array
 
 
@@ -28,6 +31,56 @@ def match(distance: Array, possible: Array, *, gate: float, margin: float) -> Ar
     clear = jnp.min(others, axis=1) > nearest + margin
     mutual = jnp.argmin(d, axis=0)[best] == jnp.arange(m)
     return jnp.where((nearest < gate) & clear & mutual, best, l).astype(jnp.int32)
+
+
+def compatible(
+    s: Array, residual: Array, rank: Array, *, probability: float = 0.999, rounds: int = 3
+) -> Array:
+    """Pairs (M,) bool that are left when those that contradict the others are taken out.
+
+    Each pair may lie in its own gate and all of them together make no sense: their errors are
+    correlated by the pose. While the joint squared distance is beyond the chi-square bound the pair
+    without which it would be least goes, `rounds` times at most.
+
+    Args:
+        s: (2 M, 2 M) joint covariance of the residuals; identity where there is no pair.
+        residual: (M, 2) zero where there is no pair.
+        rank: (M,) int32 numbers of each residual that count: 2, 1, or 0 where there is no pair.
+        probability: Of a true set to be within the bound.
+        rounds: Pairs that are taken out at most.
+
+    References:
+        Neira, Tardos (2001), Data association in stochastic mapping using the joint
+        compatibility test, with greedy removal in place of branch and bound.
+    """
+    m = rank.size
+    bound = jnp.asarray(chdtri(np.maximum(np.arange(2 * m + 1), 1), 1 - probability), s.dtype)
+    root = inverse_root(s)[0]
+    inverse = add_products(jnp.zeros_like(s), root, root)
+    v, index = residual.reshape(-1), jnp.arange(m, dtype=jnp.int32)
+    u = jnp.sum(inverse * v[None], axis=1)
+    for _ in range(rounds):
+        blocks = inverse.reshape(m, 2, m, 2)
+        a, b, d = (blocks[index, i, index, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        x, y = u.reshape(m, 2).T
+        determinant = jnp.maximum(a * d - b * b, 1e-30)
+        p, q = (d * x - b * y) / determinant, (a * y - b * x) / determinant
+        gain = jnp.where(rank > 0, x * p + y * q, -jnp.inf)
+        worst = jnp.argmax(gain).astype(jnp.int32)
+        out = (jnp.sum(v * u) > bound[jnp.sum(rank)]) & (rank[worst] > 0)
+        # Without the pair: the inverse of S without its rows is a Schur complement of this one.
+        two = blocks[:, :, worst].reshape(-1, 2)
+        solved = [
+            (d[worst] * two[:, 0] - b[worst] * two[:, 1]) / determinant[worst],
+            (a[worst] * two[:, 1] - b[worst] * two[:, 0]) / determinant[worst],
+        ]
+        less = sum(solved[k][:, None] * two[None, :, k] for k in range(2))
+        inverse = jnp.where(out, inverse - less, inverse)
+        u = jnp.where(out, u - two[:, 0] * p[worst] - two[:, 1] * q[worst], u)
+        gone = out & (index == worst)
+        rank = jnp.where(gone, 0, rank)
+        v = jnp.where(jnp.repeat(gone, 2), 0.0, v)
+    return rank > 0
 
 
 def claim_slots(worth: Array, wanted: Array) -> Array:

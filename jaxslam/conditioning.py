@@ -80,7 +80,24 @@ def condition(cov: Blocks, rows: Rows) -> Conditioned:
     return _push(cov, rows)[0]
 
 
-def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
+def innovation_cov(cov: Blocks, rows: Rows) -> Array:
+    """S = H P H^T + R, (2 M, 2 M)."""
+    return _seen(cov, rows)[2]
+
+
+def drop(rows: Rows, keep: Array) -> Rows:
+    """Rows of which those that are not kept, (M,) bool, stand for nothing."""
+    keep = keep[:, None, None]
+    return rows._replace(
+        residual=jnp.where(keep[..., 0], rows.residual, 0.0),
+        by_pose=jnp.where(keep, rows.by_pose, 0.0),
+        by_slot=jnp.where(keep, rows.by_slot, 0.0),
+        noise=jnp.where(keep, rows.noise, jnp.eye(2, dtype=rows.noise.dtype)),
+    )
+
+
+def _seen(cov: Blocks, rows: Rows) -> tuple[Array, Array, Array]:
+    """H P, of the pose (N, 3) and of the map (N, 2 L), and S (N, N)."""
     n, slot = 2 * rows.slot.size, rows.slot
     across = jnp.moveaxis(_of_slots(cov.cross, slot), 0, 2)  # (M, 2, 3)
     own = cov.map.reshape(-1, 2, cov.map.shape[1])[slot]  # (M, 2, 2 L)
@@ -90,8 +107,14 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     seen = _of_slots(hm, slot)  # (N, M, 2)
     s = sum(hp[:, None, None, k] * rows.by_pose[None, ..., k] for k in range(3))
     s += sum(seen[:, :, None, k] * rows.by_slot[None, ..., k] for k in range(2))
-    index = jnp.arange(rows.slot.size)
+    index = jnp.arange(slot.size)
     s = s.reshape(-1, 2, n // 2, 2).at[index, :, index].add(rows.noise).reshape(n, n)
+    return hp, hm, s
+
+
+def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
+    slot = rows.slot
+    hp, hm, s = _seen(cov, rows)
     root, logdet, good = inverse_root(s)
     w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
     good &= jnp.all(jnp.isfinite(w))
@@ -109,7 +132,7 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
         after.pose,
         after.cross,
         jnp.moveaxis(_of_slots(after.cross, slot), 0, 2),
-        after.map.reshape(own.shape[2] // 2, 2, -1)[slot],
+        after.map.reshape(hm.shape[1] // 2, 2, -1)[slot],
     )
     result = Conditioned(shift, after, jnp.sum(w * w), logdet, good)
     return result, _Kept(root, y_pose, y_map, w, kept, rows)

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxslam.association import match
+from jaxslam.association import compatible, match
 from jaxslam.belief import Belief
+from jaxslam.conditioning import Rows
 from jaxslam.geometry import to_world, wrap_angle, wrap_line
 from jaxslam.nodes import Nodes
 from jaxslam.sensor import expect, observation
@@ -29,6 +30,8 @@ class MatchSpec(NamedTuple):
     wall_apart: float = 0.26  # [rad] likewise between wall directions
     shape: float = 0.3  # logarithm of the ratio of clearances
     turn: float = 0.5  # [rad] between directions of corners
+    witness: float = 0.5  # [m] least distance of a pair that vouches for another
+    looks: int = 2  # scans in a row in which a place is met again without a witness
 
 
 class Recognised(NamedTuple):
@@ -111,6 +114,52 @@ def recognise(spec: MatchSpec, belief: Belief, nodes: Nodes, noise: Array) -> Re
     slot = match(distance, possible, gate=spec.gate, margin=spec.margin)
     new = (slot == belief.seen.size) & unlike(spec, belief, nodes, distance)
     return Recognised(slot, new, None)
+
+
+def second_look(
+    spec: MatchSpec, belief: Belief, nodes: Nodes, rows: Rows, s: Array
+) -> tuple[Array, Array]:
+    """Pairs (M,) bool to be believed, and the number of looks (L,) at each landmark so far.
+
+    Pairs that contradict the others are not believed. A place that was lost from sight for long is
+    met again within a gate that may be wide enough for other places: such a pair needs a witness
+    in the same scan, another pair as far from it as the map says, or `spec.looks` scans in a row.
+
+    Args:
+        spec: When a feature is a landmark.
+        belief: Predicted belief.
+        nodes: Features that are matched.
+        rows: Their innovations; zero where there is no match.
+        s: (2 M, 2 M) covariance of the innovations.
+    """
+    m, size = rows.slot.size, belief.seen.size
+    index = jnp.arange(m, dtype=jnp.int32)
+    pair = jnp.any(rows.by_slot != 0.0, axis=(1, 2))
+    place = pair & (nodes.kind != WALL)
+    rank = jnp.where(pair, jnp.where(nodes.kind == WALL, 1, 2), 0).astype(jnp.int32)
+    agrees = compatible(s, rows.residual, rank)
+
+    spread = s.reshape(m, 2, m, 2)[index, :, index] - rows.noise
+    far2 = jnp.sum(nodes.xy**2, axis=1)
+    doubtful = place & (spread[:, 0, 0] + far2 * spread[:, 1, 1] > spec.apart**2)
+
+    apart = lambda xy: jnp.sqrt(
+        (xy[:, None, 0] - xy[None, :, 0]) ** 2 + (xy[:, None, 1] - xy[None, :, 1]) ** 2 + 1e-6
+    )
+    seen, known = apart(nodes.xy), apart(belief.places[rows.slot])
+    variance = belief.map_cov.reshape(size, 2, size, 2)[rows.slot][:, :, rows.slot]
+    own = variance[index, :, index]
+    trace = lambda x: x[..., 0, 0] + x[..., 1, 1]
+    of_map = trace(own)[:, None] + trace(own)[None] - 2 * trace(jnp.moveaxis(variance, 2, 1))
+    of_scan = rows.noise[:, 0, 0] + far2 * rows.noise[:, 1, 1]
+    of_pair = of_map + of_scan[:, None] + of_scan[None]
+    rigid = (seen - known) ** 2 < spec.gate * jnp.maximum(of_pair, 0.0)
+    rigid &= (seen > spec.witness) & (place & agrees)[None] & (index[:, None] != index[None])
+    sure = jnp.any(rigid, axis=1) | (belief.looks[rows.slot] + 1 >= spec.looks)
+    believed = agrees & (~doubtful | sure)
+    waits = place & agrees & ~believed
+    looks = belief.looks.at[jnp.where(believed, rows.slot, size)].set(0, mode="drop")
+    return believed, looks.at[jnp.where(waits, rows.slot, size)].add(1, mode="drop")
 
 
 def overdue(belief: Belief, view: tuple[float, float]) -> Array:

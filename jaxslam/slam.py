@@ -14,13 +14,14 @@ from jax import lax
 
 from jaxslam import edges, ekf, junctions, links, nodes, sensor, topomap, voronoi
 from jaxslam.belief import Belief, forget, initial, note, worth
+from jaxslam.conditioning import Blocks, drop, innovation_cov
 from jaxslam.edges import RunSpec
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.links import Links
 from jaxslam.motion import Robot, process_noise, wheel_coefficients
 from jaxslam.nodes import Nodes, NodeSpec
-from jaxslam.recognition import MatchSpec, identify, overdue, recognise, twin
+from jaxslam.recognition import MatchSpec, identify, overdue, recognise, second_look, twin
 from jaxslam.types import CORNER, NODE, WALL, Array
 
 BATCH = 16  # scans that are looked at together
@@ -248,6 +249,13 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     used &= jnp.zeros_like(used).at[order].set(True)
     some = jax.tree.map(lambda x: x[order], (seen, r, jnp.where(used, slot, size)))
     rows = ekf.innovations(before, *some, **how)
+    if inputs.known is None:
+        cov = Blocks(before.pose_cov, before.cross_cov, before.map_cov)
+        s = lax.stop_gradient(innovation_cov(cov, rows))
+        believed, looks = second_look(config.matching, before, some[0], rows, s)
+        rows, before = drop(rows, believed), before._replace(looks=looks)
+        doubted = used & jnp.zeros_like(used).at[order].set(~believed)
+        used, slot = used & ~doubted, jnp.where(doubted, size, slot)
     after, done = ekf.update(before, rows, **how)
     nis, logdet = done.nis, done.logdet
     finite = jnp.all(jnp.isfinite(after.mean)) & done.good

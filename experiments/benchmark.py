@@ -1,8 +1,9 @@
 """Speed of the whole chain, of the front end and of the automaton, on one core, after compilation.
 
 Ray casting, front end and filter of runs of the office drive; the stages of the front end; the
-automaton beside hand-written C and other libraries (`pip install '.[bench]'`). Seconds depend on
-the machine; shares and ratios, measured in one run, depend on it little.
+automaton, and the filter with its gradient, beside hand-written C and other libraries
+(`pip install '.[bench]'`). Seconds depend on the machine; shares and ratios, measured in one run,
+depend on it little.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-from experiments import common, peers
+from experiments import common, estimator, peers
 from experiments.one_core import least, pin, seconds
 from jaxslam import edges, junctions, monte_carlo, nodes, slam, voronoi
 from jaxslam.grid import seen_free
@@ -123,20 +124,22 @@ def front_end(scans: Scan, maps: int, repeats: int) -> common.Numbers:
     }
 
 
-def compute(seed: int, runs: int, maps: int, repeats: int) -> common.Numbers:
+def compute(seed: int, runs: int, maps: int, drives: int, repeats: int) -> common.Numbers:
     """All numbers, by what they are of."""
     of_chain, scans = chain(seed, runs, repeats)
+    of_filter = estimator.compute(seed, drives, repeats, office=runs)
     return {
         "seed": seed,
         "cores": 1,
         "chain": of_chain,
         "front_end": front_end(scans, maps, repeats),
+        "estimator": of_filter,
     }
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """Bars: time of each part of the chain and of the front end, and the automaton's peers."""
-    figure, axes = common.canvas(11, 5.6, 2, 2)
+    """Bars: time of each part of the chain and of the front end; peers of automaton and filter."""
+    figure, axes = common.canvas(11, 8.4, 3, 2)
     of = numbers["front_end"]
     bars(axes[0, 0], numbers["chain"]["ms_per_scan"], "%.2f", "chain: milliseconds a scan")
     bars(axes[0, 1], of["ms_per_scan"], "%.3f", "front end: milliseconds a scan")
@@ -146,8 +149,13 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     rows = dict(sorted(rows.items(), key=lambda item: item[1]["ms_in_batch"]))
     batch = {name: row["ms_in_batch"] for name, row in rows.items()}
     bars(axes[1, 1], batch, "%.3g", f"batch of {of['batch']}: milliseconds a map")
-    axes[1, 1].set_xscale("log")
-    axes[1, 1].margins(x=0.25)
+    filters = numbers["estimator"]
+    steps = {kind: estimator.per_step(filters, kind) for kind in ("filter", "gradient")}
+    bars(axes[2, 0], steps["filter"], "%.3g", "filter: microseconds a step of a run, in a batch")
+    bars(axes[2, 1], steps["gradient"], "%.3g", "value and gradient: microseconds a step of a run")
+    for axis in (axes[1, 1], *axes[2]):
+        axis.set_xscale("log")
+        axis.margins(x=0.25)
     figure.savefig(path)
 
 
@@ -165,8 +173,8 @@ def bars(axis: Any, values: dict[str, float], form: str, title: str) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the benchmark."""
     pin()
-    given = common.parse(__doc__, argv, runs=4, maps=256, repeats=3)
-    numbers = compute(given.seed, given.runs, given.maps, given.repeats)
+    given = common.parse(__doc__, argv, runs=4, maps=256, drives=512, repeats=3)
+    numbers = compute(given.seed, given.runs, given.maps, given.drives, given.repeats)
     common.save(given.out, "benchmark", numbers, draw)
     of_chain, of_front = numbers["chain"], numbers["front_end"]
     percent = lambda shares: {name: f"{100 * share:.0f} %" for name, share in shares.items()}
@@ -174,6 +182,7 @@ def main(argv: list[str] | None = None) -> None:
     print(percent(of_chain["share_of_chain"]))
     print(f"front end: {of_front['scans_per_s']:.0f} scans a second", percent(of_front["share"]))
     ratio = {name: x for name, x in of_front.items() if name.startswith("automaton")}
+    ratio |= {name: numbers["estimator"][name] for name in ("filter_vs_c", "gradient_vs_filter")}
     print({name: x if x is None else round(x, 2) for name, x in ratio.items()})
 
 

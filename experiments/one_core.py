@@ -14,10 +14,19 @@ THREADS = Path("/proc/self/task")
 
 def pin() -> None:
     """Keep this process on one core, where the system can; before JAX does its first work."""
+    if hasattr(os, "sched_getaffinity"):
+        _stay({min(os.sched_getaffinity(0))})
+
+
+def unpin() -> None:
+    """Let this process on all cores again, which its parent may have kept from it."""
+    _stay(set(range(os.cpu_count() or 1)))
+
+
+def _stay(cores: set[int]) -> None:
     if hasattr(os, "sched_setaffinity") and THREADS.is_dir():
-        core = {min(os.sched_getaffinity(0))}
         for thread in THREADS.iterdir():
-            os.sched_setaffinity(int(thread.name), core)
+            os.sched_setaffinity(int(thread.name), cores)
 
 
 def seconds(function: Callable, *arguments: Any) -> float:

@@ -39,8 +39,8 @@ class Rival(NamedTuple):
         return float(re.search(r"([\d.]+) ms/map", told)[1])
 
 
-def compiled(source: Path, folder: Path) -> Rival:
-    """The C program of a source file, compiled to a folder."""
+def compiled(source: Path, folder: Path, *flags: str) -> Rival:
+    """The C program of a source file, compiled to a folder, with more flags for the compiler."""
     compiler = shutil.which("gcc") or shutil.which("cc")
     if not source.is_file():
         return Rival(None, f"no {source.name} beside the repository: not compared with C")
@@ -49,7 +49,7 @@ def compiled(source: Path, folder: Path) -> Rival:
     text = source.read_text().replace("R=2000", "R=100")  # short runs find quiet moments too
     (folder / source.name).write_text(text)
     program = folder / source.stem
-    command = [compiler, "-O3", "-march=native", folder / source.name, "-o", program]
+    command = [compiler, "-O3", "-march=native", folder / source.name, "-o", program, *flags]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         return Rival(None, f"{source.name} does not compile: not compared with C")

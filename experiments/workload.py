@@ -161,8 +161,8 @@ def _start(linearisation: str, run: Drive) -> Belief:
     return belief._replace(seen=jnp.where(given, 1, 0).astype(jnp.int32))
 
 
-def filter_one(linearisation: str, run: Drive) -> Steps:
-    """Filter one run, known association; what is seen first is taken in."""
+def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:
+    """Filter one run, known association; what is seen first is taken in, if the map `grows`."""
     how = {"linearisation": linearisation}
     size = run.prior.shape[0]
 
@@ -173,8 +173,9 @@ def filter_one(linearisation: str, run: Drive) -> Steps:
         known = (who >= 0) & (belief.seen.at[who].get(mode="fill", fill_value=0) > 0)
         rows = ekf.innovations(belief, features, r, jnp.where(known, who, size), **how)
         belief, done = ekf.update(belief, rows, **how)
-        new, at = (who >= 0) & ~known, jnp.where(who >= 0, who, size)
-        belief, _ = ekf.augment(belief, features, r, new, most=who.size, at=at, **how)
+        if grows:
+            new, at = (who >= 0) & ~known, jnp.where(who >= 0, who, size)
+            belief, _ = ekf.augment(belief, features, r, new, most=who.size, at=at, **how)
         dof = 2 * jnp.sum(known, dtype=jnp.int32)
         density = done.nis + done.logdet + dof.astype(r.dtype) * jnp.log(2 * jnp.pi).astype(r.dtype)
         return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, -0.5 * density)

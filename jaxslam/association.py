@@ -1,11 +1,24 @@
-"""Which feature is which landmark: gates on distances; knows no filter."""
+"""Which feature is which landmark: gates on distances, and numbers over a run; knows no filter."""
 
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtri
 
+from jaxslam.geometry import to_world
 from jaxslam.linalg import add_products, inverse_root
-from jaxslam.types import Array
+from jaxslam.nodes import Nodes
+from jaxslam.types import WALL, Array, expect
+
+
+class Landmarks(NamedTuple):
+    """Landmarks of a filtered run, numbered without gaps, padded to L."""
+
+    which: Array  # (T, M) int32 landmark 0..L-1 of each feature, L for none
+    places: Array  # (L, 2) first guess; zero for padding
+    id: Array  # (L,) int32 of the filter; -1 for padding
 
 
 def match(distance: Array, possible: Array, *, gate: float, margin: float) -> Array:
@@ -99,3 +112,48 @@ def claim_slots(worth: Array, wanted: Array) -> Array:
     turn = jnp.where(wanted, jnp.cumsum(wanted, dtype=jnp.int32) - 1, l)
     mine = (turn[:, None] == place[None]) & (worth < jnp.inf)[None]
     return jnp.where(jnp.any(mine, axis=1), jnp.argmax(mine, axis=1), l).astype(jnp.int32)
+
+
+def landmarks(
+    id: Array, poses: Array, nodes: Nodes, *, least: int = 2, size: int | None = None
+) -> Landmarks:
+    """Landmarks of a run by the filter's ids, which unlike its slots are never used again.
+
+    Runs on the host. The first guess is the mean of all sightings.
+
+    Args:
+        id: (T, M) int32 the filter's landmark of each feature, -1 for none.
+        poses: (T, 3) of the filter.
+        nodes: [T] features that it was given.
+        least: Landmarks that were seen less often are left out.
+        size: L, so that several runs have the same; by default as many as there are, or 1.
+
+    Raises:
+        ValueError: The shapes do not fit, or there are more than `size` landmarks.
+    """
+    expect("id", id, nodes.kind.shape, jnp.int32)
+    expect("poses", poses, nodes.kind.shape[:1] + (3,), jnp.floating)
+    id, is_wall = np.asarray(id), np.asarray(nodes.kind) == WALL
+    names, count = np.unique(id[id >= 0], return_counts=True)
+    names = names[count >= least]
+    size = max(len(names), 1) if size is None else size
+    if len(names) > size:
+        raise ValueError(f"{len(names)} landmarks are more than size = {size}")
+    which = np.where(np.isin(id, names), np.searchsorted(names, id), size)
+    kept = which < size
+    # Directions of undirected lines are averaged as vectors at twice the angle.
+    turned = np.asarray(nodes.direction) + np.asarray(poses)[:, 2:]
+    lines = np.stack([np.cos(2 * turned[kept]), np.sin(2 * turned[kept])], axis=-1)
+    points = np.asarray(jax.vmap(to_world)(poses, nodes.xy))[kept]
+    total = np.zeros((size, 2), points.dtype)
+    np.add.at(total, which[kept], np.where(is_wall[kept][:, None], lines, points))
+    places = total / np.maximum(np.bincount(which[kept], minlength=size), 1)[:, None]
+    walls = which[kept & is_wall]
+    places[walls, 0] = np.arctan2(total[walls, 1], total[walls, 0]) / 2
+    places[walls, 1] = 0.0
+    padded = np.pad(names, (0, size - len(names)), constant_values=-1)
+    return Landmarks(
+        which=jnp.asarray(which, jnp.int32),
+        places=jnp.asarray(places, points.dtype),
+        id=jnp.asarray(padded, jnp.int32),
+    )

@@ -54,3 +54,9 @@ def inverse_root(s: Array) -> tuple[Array, Array, Array]:
     good = jnp.all(pivot > 0.0) & jnp.all(jnp.isfinite(pivot))
     logdet = jnp.sum(jnp.log(jnp.where(good, pivot, 1.0)))
     return jnp.where(good, jnp.stack(rows), 0.0), logdet, good
+
+
+def whiten(s: Array, b: Array) -> Array:
+    """Return L^-1 b (n, k) for S = L L^T (n, n) and b (n, k); NaN where S is not such a product."""
+    root, _, good = inverse_root(s)
+    return jnp.where(good, root, jnp.nan) @ b

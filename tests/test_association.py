@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import reference_filter
 
-from jaxslam.association import claim_slots, match
+from jaxslam.association import claim_slots, landmarks, match
+from jaxslam.nodes import from_polar
+from jaxslam.types import NODE, WALL
 
 GATE, MARGIN = 9.0, 1.0
 
@@ -72,3 +74,43 @@ def test_a_full_map_drops_new_landmarks():
     np.testing.assert_array_equal(slots, [1, 3])
     np.testing.assert_array_equal(jnp.zeros(3).at[slots].set(1.0, mode="drop"), [0, 1, 0])
     np.testing.assert_array_equal(claim_slots(jnp.full(3, jnp.inf), jnp.ones(2, bool)), [3, 3])
+
+
+ID = np.array([[7, 3, -1], [9, 7, 3], [-1, 3, 5], [7, -1, 12]], np.int32)
+POSES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [1.0, 1.0, 3.0], [2.0, 0.5, -3.0]])
+PLACE = np.array([3.0, 2.0])  # of landmark 7; landmark 3 is a wall along y
+
+
+def sightings():
+    """What four poses see of the landmarks ID, with errors that cancel; NaN where nothing is."""
+    kind = np.where(ID == 3, WALL, NODE).astype(np.int32)
+    offset = PLACE - POSES[:, :2]
+    polar = np.stack([np.hypot(*offset.T), np.arctan2(*offset.T[::-1]) - POSES[:, 2]], axis=-1)
+    polar = np.where((ID >= 0)[..., None], polar[:, None], np.nan)
+    seen = jax.vmap(from_polar)(jnp.array(polar), jnp.ones(ID.shape, bool))
+    wobble = np.array([0.1, -0.3, 0.2, 0.0])  # about pi / 2, where a line's direction wraps
+    line = reference_filter.wrap_line(np.pi / 2 + wobble - POSES[:, 2])[:, None]
+    return seen._replace(kind=jnp.array(kind), direction=jnp.array(np.where(ID == 3, line, np.nan)))
+
+
+def test_landmarks_are_numbered_and_placed_by_all_their_sightings():
+    marks = landmarks(jnp.array(ID), jnp.array(POSES), sightings(), least=3, size=4)
+    np.testing.assert_array_equal(marks.which, [[1, 0, 4], [4, 1, 0], [4, 0, 4], [1, 4, 4]])
+    np.testing.assert_array_equal(marks.id, [3, 7, -1, -1])
+    assert marks.which.dtype == marks.id.dtype == jnp.int32
+    np.testing.assert_allclose(marks.places[1], PLACE, atol=1e-12)
+    np.testing.assert_allclose(np.abs(marks.places[0]), [np.pi / 2, 0.0], atol=1e-2)
+    np.testing.assert_array_equal(marks.places[2:], 0.0)
+    every = landmarks(jnp.array(ID), jnp.array(POSES), sightings(), least=1)
+    assert every.id.tolist() == [3, 5, 7, 9, 12]
+    none = landmarks(jnp.full(ID.shape, -1, jnp.int32), jnp.array(POSES), sightings())
+    assert none.id.tolist() == [-1] and np.all(none.which == 1)
+
+
+def test_landmarks_that_do_not_fit_are_told():
+    with pytest.raises(ValueError, match="2 landmarks are more than size = 1"):
+        landmarks(jnp.array(ID), jnp.array(POSES), sightings(), least=3, size=1)
+    with pytest.raises(ValueError, match=r"id is int32 \(4, 2\), not"):
+        landmarks(jnp.array(ID[:, :2]), jnp.array(POSES), sightings())
+    with pytest.raises(ValueError, match=r"poses is .*\(3, 3\), not"):
+        landmarks(jnp.array(ID), jnp.array(POSES[:3]), sightings())

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-from experiments import common, estimator, peers
+from experiments import common, estimator, filters, peers
 from experiments.one_core import least, pin, seconds
 from jaxslam import edges, junctions, monte_carlo, nodes, slam, voronoi
 from jaxslam.grid import seen_free
@@ -149,8 +149,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     rows = dict(sorted(rows.items(), key=lambda item: item[1]["ms_in_batch"]))
     batch = {name: row["ms_in_batch"] for name, row in rows.items()}
     bars(axes[1, 1], batch, "%.3g", f"batch of {of['batch']}: milliseconds a map")
-    filters = numbers["estimator"]
-    steps = {kind: estimator.per_step(filters, kind) for kind in ("filter", "gradient")}
+    steps = {kind: filters.per_step(numbers["estimator"], kind) for kind in ("filter", "gradient")}
     bars(axes[2, 0], steps["filter"], "%.3g", "filter: microseconds a step of a run, in a batch")
     bars(axes[2, 1], steps["gradient"], "%.3g", "value and gradient: microseconds a step of a run")
     for axis in (axes[1, 1], *axes[2]):

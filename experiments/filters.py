@@ -23,7 +23,7 @@ from jaxslam.types import Array
 STD = (0.02, 0.02, 0.01, 0.10, 0.03)  # of `workload.rings`: odometry x, y, heading; range, bearing
 POSE_STD = 1e-4  # of the first pose [m, rad]; factors of a covariance have no derivative at zero
 BATCH = 64  # runs together
-PATIENCE = 4.0  # [s] for a call of a peer; it is of fewer runs where that is not enough
+PATIENCE = 2.0  # [s] for a call of a peer; it is of fewer runs where that is not enough
 Track = Callable[[Array, Drive], Array]  # noise (5,) and a run to positions (T, 2)
 
 
@@ -222,3 +222,15 @@ def table(drive: Drive) -> Numbers:
         except Exception as error:  # a peer made for another version of JAX fails in many ways
             rows[name] = {"filter": None, "note": f"{type(error).__name__}: {error}"[:200]}
     return rows
+
+
+def per_step(numbers: Numbers, kind: str) -> dict[str, float]:
+    """Microseconds of `filter` or `gradient` in a batch: ours, in C, and of each peer that has it.
+
+    The fastest comes first.
+    """
+    of = {"jaxslam": numbers[f"{kind}_us"], "C": numbers["c_us"] if kind == "filter" else None}
+    for name, row in numbers["peers"].items():
+        if isinstance(row, dict) and row.get(kind):
+            of[name] = row[kind]["us_in_batch"]
+    return dict(sorted(((k, us) for k, us in of.items() if us), key=lambda item: item[1]))

@@ -164,7 +164,7 @@ def add(arcs: Arcs, ids: Array, pose: Array, links: Links, scan: Scan, lidar: Li
     worse = (mine[None] < mine[:, None]) | ((mine[None] == mine[:, None]) & earlier)
     good &= ~jnp.any(rival & worse, axis=1)
 
-    fresh = claim_slots(arcs.seen == 0, good & ~known)
+    fresh = claim_slots(jnp.where(arcs.seen == 0, 0.0, jnp.inf), good & ~known)
     slot = jnp.where(good, jnp.where(known, best, fresh), size)
     at = jnp.minimum(slot, size - 1)
     part = jnp.where(known, 1.0 / (arcs.seen[at] + 1).astype(line.dtype), 1.0)

@@ -274,11 +274,12 @@ def _stopwatch() -> Iterator[dict[str, float]]:
 def _watch(parts: Iterable[Track], runs: int) -> Track:
     """All tracks of an experiment; shows how far it is, and its first result on a line."""
     done: list[Track] = []
+    errors: list[np.ndarray] = []
     with tqdm(total=runs, unit="run", desc="compiling", mininterval=0.5) as bar:
         for part in parts:
             done.append(part)
-            so_far = np.concatenate([report.error_of(p.estimate, p.truth) for p in done])
-            rmse = monte_carlo.errors(so_far)["position_rmse_m"]
+            errors.append(report.error_of(part.estimate, part.truth))
+            rmse = monte_carlo.errors(np.concatenate(errors))["position_rmse_m"]
             if len(done) == 1:
                 blind = monte_carlo.errors(report.error_of(part.odometry, part.truth))[
                     "position_rmse_m"

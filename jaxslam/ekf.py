@@ -31,6 +31,11 @@ def check_linearisation(name: str) -> None:
         raise ValueError(f"linearisation is {name!r}; known are {known}")
 
 
+def blocks(belief: Belief) -> Blocks:
+    """Covariance of the belief, as conditioning takes it."""
+    return Blocks(belief.pose_cov, belief.cross_cov, belief.map_cov)
+
+
 def predict(
     belief: Belief, motion: Array, noise: Array, *, linearisation: str = "standard"
 ) -> Belief:
@@ -123,7 +128,7 @@ def update(
         3-D invariant-EKF SLAM".
     """
     check_linearisation(linearisation)
-    done = condition(Blocks(belief.pose_cov, belief.cross_cov, belief.map_cov), seen)
+    done = condition(blocks(belief), seen)
     after = belief._replace(pose_cov=done.cov.pose, cross_cov=done.cov.cross, map_cov=done.cov.map)
     if linearisation == "invariant":
         after = _retract(after, done.shift)

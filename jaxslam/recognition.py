@@ -67,6 +67,11 @@ def distances(belief: Belief, nodes: Nodes, noise: Array) -> Array:
     x = seen[:, None, 0] - expected[None, :, 0]
     y = wrap_angle(seen[:, None, 1] - expected[None, :, 1])
     x, y = jnp.where(is_wall, wrap_line(x), x), jnp.where(is_wall, 0.0, y)
+    return _square(a, b, d, x, y)
+
+
+def _square(a: Array, b: Array, d: Array, x: Array, y: Array) -> Array:
+    """Squared Mahalanobis norms of (x, y) by covariances [[a, b], [b, d]], all of one shape."""
     determinant = jnp.maximum(a * d - b * b, 1e-12)
     return (d * x * x - 2 * b * x * y + a * y * y) / determinant
 
@@ -195,8 +200,7 @@ def twin(spec: MatchSpec, belief: Belief, slot: Array) -> Array:
     index = jnp.arange(size, dtype=jnp.int32)
     across = blocks[at].transpose(1, 0, 2)  # (L, 2, 2) of the slot and each
     s = blocks[index, :, index] + blocks[at, :, at][None] - across - jnp.swapaxes(across, 1, 2)
-    a, b, d = s[:, 0, 0] + 1e-4, s[:, 0, 1], s[:, 1, 1] + 1e-4
-    distance = (d * x * x - 2 * b * x * y + a * y * y) / jnp.maximum(a * d - b * b, 1e-12)
+    distance = _square(s[:, 0, 0] + 1e-4, s[:, 0, 1], s[:, 1, 1] + 1e-4, x, y)
     is_node = kind == NODE
     like = jnp.abs(jnp.log(shape / shape[at])) < spec.shape
     facing = jnp.abs(wrap_angle(belief.direction - belief.direction[at])) < spec.turn

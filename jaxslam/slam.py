@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxslam import edges, ekf, junctions, links, nodes, sensor, topomap, voronoi
 from jaxslam.belief import Belief, forget, initial, note, worth
-from jaxslam.conditioning import Blocks, drop, innovation_cov
+from jaxslam.conditioning import drop, innovation_cov
 from jaxslam.edges import RunSpec
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
@@ -250,8 +250,7 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     some = jax.tree.map(lambda x: x[order], (seen, r, jnp.where(used, slot, size)))
     rows = ekf.innovations(before, *some, **how)
     if inputs.known is None:
-        cov = Blocks(before.pose_cov, before.cross_cov, before.map_cov)
-        s = lax.stop_gradient(innovation_cov(cov, rows))
+        s = lax.stop_gradient(innovation_cov(ekf.blocks(before), rows))
         believed, looks = second_look(config.matching, before, some[0], rows, s)
         rows, before = drop(rows, believed), before._replace(looks=looks)
         doubted = used & jnp.zeros_like(used).at[order].set(~believed)
@@ -307,8 +306,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
 def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Belief, Info]:
     """Filter one log: `inputs` leads with T, and so does the info.
 
-    A derivative computes each step again instead of storing it, so that it needs the memory of T
-    beliefs only.
+    A derivative keeps of each step the rows of the covariance that it touched, never the whole.
+    It is taken in reverse only (`conditioning.condition`).
     """
 
     def body(belief: Belief, now: Inputs) -> tuple[Belief, Info]:

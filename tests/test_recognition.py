@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from jaxslam import ekf, recognition
 from jaxslam.association import compatible
 from jaxslam.belief import initial, know, worth
-from jaxslam.conditioning import Blocks, drop, innovation_cov
+from jaxslam.conditioning import drop, innovation_cov
 from jaxslam.nodes import from_polar
 from jaxslam.recognition import MatchSpec
 from jaxslam.types import CORNER, NODE, WALL
@@ -66,8 +66,8 @@ def look(belief, polar, slot):
     nodes = from_polar(polar, jnp.ones(len(polar), bool))
     r = jnp.tile(jnp.diag(jnp.array([0.01, 0.005]) ** 2), (len(polar), 1, 1))
     rows = ekf.innovations(belief, nodes, r, slot)
-    cov = Blocks(belief.pose_cov, belief.cross_cov, belief.map_cov)
-    return recognition.second_look(MatchSpec(), belief, nodes, rows, innovation_cov(cov, rows))
+    s = innovation_cov(ekf.blocks(belief), rows)
+    return recognition.second_look(MatchSpec(), belief, nodes, rows, s)
 
 
 def looked(belief, polar, slot):

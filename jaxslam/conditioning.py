@@ -85,6 +85,15 @@ def innovation_cov(cov: Blocks, rows: Rows) -> Array:
     return _seen(cov, rows)[2]
 
 
+def plus(cov: Blocks, left: tuple[Array, Array], right: tuple[Array, Array], *, sign=1) -> Blocks:
+    """Add the products of rows, of pose (k, 3) and map (k, 2 L) each: cov + sign left^T right."""
+    return Blocks(
+        pose=add_products(cov.pose, left[0], right[0], sign=sign),
+        cross=add_products(cov.cross, left[0], right[1], sign=sign),
+        map=add_products(cov.map, left[1], right[1], sign=sign),
+    )
+
+
 def drop(rows: Rows, keep: Array) -> Rows:
     """Rows of which those that are not kept, (M,) bool, stand for nothing."""
     keep = keep[:, None, None]
@@ -122,11 +131,7 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     y_pose = add_products(jnp.zeros_like(hp), root.T, hp)
     y_map = add_products(jnp.zeros_like(hm), root.T, hm)
     y_pose, y_map = lax.optimization_barrier((y_pose, y_map))
-    after = Blocks(
-        pose=add_products(cov.pose, y_pose, y_pose, sign=-1),
-        cross=add_products(cov.cross, y_pose, y_map, sign=-1),
-        map=add_products(cov.map, y_map, y_map, sign=-1),
-    )
+    after = plus(cov, (y_pose, y_map), (y_pose, y_map), sign=-1)
     shift = jnp.concatenate([_mix(w, y_pose), _mix(w, y_map)])
     kept = (
         after.pose,

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from jaxslam.association import claim_slots
 from jaxslam.belief import Belief, forget
-from jaxslam.conditioning import Blocks, Conditioned, Rows, condition
+from jaxslam.conditioning import Blocks, Conditioned, Rows, condition, plus
 from jaxslam.geometry import compose, rotation, to_world, wrap_angle, wrap_line
-from jaxslam.linalg import add_products, inverse_root
+from jaxslam.linalg import inverse_root
 from jaxslam.nodes import Nodes
 from jaxslam.sensor import expect, observation, residual
 from jaxslam.types import WALL, Array
@@ -34,6 +34,15 @@ def check_linearisation(name: str) -> None:
 def blocks(belief: Belief) -> Blocks:
     """Covariance of the belief, as conditioning takes it."""
     return Blocks(belief.pose_cov, belief.cross_cov, belief.map_cov)
+
+
+def _with(belief: Belief, mean: Array, cov: Blocks) -> Belief:
+    return belief._replace(
+        mean=mean.at[2].set(wrap_angle(mean[2])),
+        pose_cov=cov.pose,
+        cross_cov=cov.cross,
+        map_cov=cov.map,
+    )
 
 
 def predict(
@@ -129,13 +138,10 @@ def update(
     """
     check_linearisation(linearisation)
     done = condition(blocks(belief), seen)
-    after = belief._replace(pose_cov=done.cov.pose, cross_cov=done.cov.cross, map_cov=done.cov.map)
+    shift, cov = done.shift, done.cov
     if linearisation == "invariant":
-        after = _retract(after, done.shift)
-    else:
-        mean = belief.mean + done.shift
-        after = after._replace(mean=mean.at[2].set(wrap_angle(mean[2])))
-    return after, done
+        shift, cov = _retracted(shift, cov, belief.kind == WALL)
+    return _with(belief, belief.mean + shift, cov), done
 
 
 def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Belief:
@@ -157,52 +163,43 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     s = difference(hm.reshape(2, size, 2)[:, pair]) + std**2 * jnp.eye(2, dtype=hm.dtype)
     root, _, good = inverse_root(s)
     root = jnp.where(found & good, root, 0.0)
-    y_pose, y_map = root @ hp, root @ hm
+    y = root @ hp, root @ hm
     w = -root @ difference(belief.places[pair])
-    mean = belief.mean + jnp.concatenate([w @ y_pose, w @ y_map])
+    belief = _with(
+        belief,
+        belief.mean + jnp.concatenate([w @ y[0], w @ y[1]]),
+        plus(blocks(belief), y, y, sign=-1),
+    )
     gone = found & good & (jnp.arange(size, dtype=jnp.int32) == drop)
     more = jnp.where(found & good, belief.seen.at[drop].get(mode="fill", fill_value=0), 0)
-    belief = belief._replace(
-        mean=mean.at[2].set(wrap_angle(mean[2])),
-        pose_cov=add_products(belief.pose_cov, y_pose, y_pose, sign=-1),
-        cross_cov=add_products(belief.cross_cov, y_pose, y_map, sign=-1),
-        map_cov=add_products(belief.map_cov, y_map, y_map, sign=-1),
-        seen=belief.seen.at[keep].add(more),
-    )
+    belief = belief._replace(seen=belief.seen.at[keep].add(more))
     return forget(belief, gone)
 
 
-def _retract(belief: Belief, shift: Array) -> Belief:
-    """Move the mean by a shift (D,) along the group SE_{1+L}(2), and the covariance with it.
+def _retracted(shift: Array, cov: Blocks, flat: Array) -> tuple[Array, Blocks]:
+    """A shift (D,) as a move along the group SE_{1+L}(2), and the covariance that moves with it.
 
     The right-invariant error of a position p is p - exp(turn) p_mean: a filter that keeps the
     covariance of that error as it is when its mean moves is, in plain coordinates, one that swings
     each shift by half the turn, and then adds to each position the lever of the heading's error
-    by which it moved.
+    by which it moved. Slots that are walls, `flat` (L,) bool, are directions: they do not swing.
     """
     turn = shift[2]
-    half = turn / 2
     # Left Jacobian of SO(2): the mean of the rotations by 0..turn.
-    swing = jnp.sinc(turn / (2 * jnp.pi)) * rotation(half)
-    flat = belief.kind == WALL
+    swing = jnp.sinc(turn / (2 * jnp.pi)) * rotation(turn / 2)
     by_slot = shift[3:].reshape(-1, 2)
     moved = jnp.where(flat[:, None], by_slot, by_slot @ swing.T)
     step = jnp.concatenate([swing @ shift[:2], turn[None]])
     lever_pose = jnp.stack([-step[1], step[0], jnp.zeros_like(turn)])
     lever = jnp.stack([-moved[:, 1], moved[:, 0]], axis=-1)
     lever = jnp.where(flat[:, None], 0.0, lever).reshape(-1)
-    mean = belief.mean + jnp.concatenate([step, moved.reshape(-1)])
     # P' = (I + lever e^T) P (I + e lever^T), e the heading.
-    spread = belief.pose_cov[2, 2]
-    pose = belief.pose_cov[2] + spread * lever_pose / 2
-    map = belief.cross_cov[2] + spread * lever / 2
+    spread = cov.pose[2, 2]
+    pose, map = cov.pose[2] + spread * lever_pose / 2, cov.cross[2] + spread * lever / 2
     two = lambda a, b: jnp.stack([a, b])
-    return belief._replace(
-        mean=mean.at[2].set(wrap_angle(mean[2])),
-        pose_cov=add_products(belief.pose_cov, two(lever_pose, pose), two(pose, lever_pose)),
-        cross_cov=add_products(belief.cross_cov, two(lever_pose, pose), two(map, lever)),
-        map_cov=add_products(belief.map_cov, two(lever, map), two(map, lever)),
-    )
+    left = two(lever_pose, pose), two(lever, map)
+    right = two(pose, lever_pose), two(map, lever)
+    return jnp.concatenate([step, moved.reshape(-1)]), plus(cov, left, right)
 
 
 def augment(

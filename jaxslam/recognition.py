@@ -15,7 +15,7 @@ from jaxslam.belief import Belief
 from jaxslam.conditioning import Rows
 from jaxslam.geometry import to_world, wrap_angle, wrap_line
 from jaxslam.nodes import Nodes
-from jaxslam.sensor import expect, observation
+from jaxslam.sensor import differences, expect, observation
 from jaxslam.types import CORNER, NODE, WALL, Array
 from jaxslam.types import expect as expect_type
 
@@ -63,11 +63,9 @@ def distances(belief: Belief, nodes: Nodes, noise: Array) -> Array:
     spread += jnp.einsum("lij,ljk,lmk->lim", by_slot, own, by_slot)
     entry = lambda i, j: spread[None, :, i, j] + noise[:, None, i, j]
     a, b, d = entry(0, 0), 0.5 * (entry(0, 1) + entry(1, 0)), entry(1, 1)
-    seen, is_wall = observation(nodes), (belief.kind == WALL)[None]
-    x = seen[:, None, 0] - expected[None, :, 0]
-    y = wrap_angle(seen[:, None, 1] - expected[None, :, 1])
-    x, y = jnp.where(is_wall, wrap_line(x), x), jnp.where(is_wall, 0.0, y)
-    return _square(a, b, d, x, y)
+    seen = observation(nodes)
+    off = (seen[:, None, k] - expected[None, :, k] for k in range(2))
+    return _square(a, b, d, *differences(*off, (belief.kind == WALL)[None]))
 
 
 def _square(a: Array, b: Array, d: Array, x: Array, y: Array) -> Array:
@@ -84,13 +82,18 @@ def alike(belief: Belief, nodes: Nodes, *, shape: float, turn: float) -> Array:
     """
     same = nodes.kind[:, None] == belief.kind[None]
     same &= (belief.seen > 0)[None] & nodes.valid[:, None]
-    ratio = jnp.maximum(nodes.shape[:, None], 1e-3) / jnp.maximum(belief.shape[None], 1e-3)
-    clearance = jnp.abs(jnp.log(ratio)) < shape
-    facing = wrap_angle(nodes.direction[:, None] + belief.pose[2] - belief.direction[None])
-    opening = nodes.shape[:, None] - belief.shape[None]
-    corner = (jnp.abs(facing) < turn) & (jnp.abs(opening) < turn)
-    kind = nodes.kind[:, None]
-    return same & jnp.where(kind == NODE, clearance, jnp.where(kind == CORNER, corner, True))
+    facing = nodes.direction[:, None] + belief.pose[2] - belief.direction[None]
+    shapes = nodes.shape[:, None], belief.shape[None]
+    return same & _resemble(nodes.kind[:, None], *shapes, facing, shape=shape, turn=turn)
+
+
+def _resemble(
+    kind: Array, one: Array, other: Array, facing: Array, *, shape: float, turn: float
+) -> Array:
+    """Whether things of one kind look alike, by their two shapes and what they face apart [rad]."""
+    clearance = jnp.abs(jnp.log(jnp.maximum(one, 1e-3) / jnp.maximum(other, 1e-3))) < shape
+    corner = (jnp.abs(wrap_angle(facing)) < turn) & (jnp.abs(one - other) < turn)
+    return jnp.where(kind == NODE, clearance, jnp.where(kind == CORNER, corner, True))
 
 
 def unlike(spec: MatchSpec, belief: Belief, nodes: Nodes, distance: Array) -> Array:
@@ -194,18 +197,16 @@ def twin(spec: MatchSpec, belief: Belief, slot: Array) -> Array:
     """
     size = belief.seen.size
     at = jnp.minimum(slot, size - 1)
-    place, kind, shape = belief.places, belief.kind, jnp.maximum(belief.shape, 1e-3)
+    place, kind, shape = belief.places, belief.kind, belief.shape
     x, y = (place - place[at][None]).T
     blocks = belief.map_cov.reshape(size, 2, size, 2)
     index = jnp.arange(size, dtype=jnp.int32)
     across = blocks[at].transpose(1, 0, 2)  # (L, 2, 2) of the slot and each
     s = blocks[index, :, index] + blocks[at, :, at][None] - across - jnp.swapaxes(across, 1, 2)
     distance = _square(s[:, 0, 0] + 1e-4, s[:, 0, 1], s[:, 1, 1] + 1e-4, x, y)
-    is_node = kind == NODE
-    like = jnp.abs(jnp.log(shape / shape[at])) < spec.shape
-    facing = jnp.abs(wrap_angle(belief.direction - belief.direction[at])) < spec.turn
-    like = jnp.where(is_node, like, facing & (jnp.abs(belief.shape - belief.shape[at]) < spec.turn))
-    same = like & (kind == kind[at]) & (kind != WALL) & (belief.seen > 0) & (index != at)
+    facing = belief.direction - belief.direction[at]
+    same = _resemble(kind, shape, shape[at], facing, shape=spec.shape, turn=spec.turn)
+    same &= (kind == kind[at]) & (kind != WALL) & (belief.seen > 0) & (index != at)
     same &= (x * x + y * y < spec.apart**2) & (distance < spec.gate) & (slot < size)
     best = jnp.argmin(jnp.where(same, distance, jnp.inf))
     return jnp.where(jnp.any(same), best, size).astype(jnp.int32)

@@ -51,9 +51,15 @@ def expect(pose: Array, place: Array, kind: Array) -> tuple[Array, Array, Array]
     )
 
 
+def differences(x: Array, y: Array, is_wall: Array) -> tuple[Array, Array]:
+    """Differences of observations, their two numbers apart; the one place where angles are wrapped.
+
+    Arrays of one shape each: of range [m] or a wall's direction [rad], and of bearing [rad].
+    """
+    return jnp.where(is_wall, wrap_line(x), x), jnp.where(is_wall, 0.0, wrap_angle(y))
+
+
 def residual(seen: Array, expected: Array, kind: Array) -> Array:
-    """Difference (..., 2) of observations; the one place where angles are wrapped."""
+    """Difference (..., 2) of observations."""
     error = seen - expected
-    wall = jnp.stack([wrap_line(error[..., 0]), jnp.zeros_like(error[..., 0])], axis=-1)
-    polar = jnp.stack([error[..., 0], wrap_angle(error[..., 1])], axis=-1)
-    return jnp.where((kind == WALL)[..., None], wall, polar)
+    return jnp.stack(differences(error[..., 0], error[..., 1], kind == WALL), axis=-1)

@@ -12,15 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import edges, ekf, junctions, links, nodes, sensor, topomap, voronoi
+from jaxslam import edges, ekf, junctions, links, nodes, topomap, voronoi
 from jaxslam.belief import Belief, forget, initial, note, worth
 from jaxslam.conditioning import drop, innovation_cov
 from jaxslam.edges import RunSpec
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.links import Links
-from jaxslam.motion import Robot, process_noise, wheel_coefficients
+from jaxslam.motion import process_noise
 from jaxslam.nodes import Nodes, NodeSpec
+from jaxslam.noise import Noise, sensor_noise
+from jaxslam.noise import log_noise as log_noise
+from jaxslam.noise import wheel_noise as wheel_noise
 from jaxslam.recognition import MatchSpec, identify, overdue, recognise, second_look, twin
 from jaxslam.types import CORNER, NODE, WALL, Array
 
@@ -66,16 +69,6 @@ class Config(NamedTuple):
     patience: int = 40  # steps after which an unconfirmed one is dropped
     idle: int = 5  # and after which it makes room where the map is full
     misses: int = 10  # steps in a row in which a node in plain sight was not seen; then it is gone
-
-
-class Noise(NamedTuple):
-    """Standard deviations the filter assumes; traced, so that they can be tuned by gradient."""
-
-    odometry: Array  # (4,) distance per m^.5, per rad^.5; heading per m^.5, per rad^.5
-    range: Array  # () [m] of a landmark's range, beyond its own covariance
-    bearing: Array  # () [rad] likewise
-    scale: Array  # () factor on the landmark's own standard deviation
-    wall: Array  # () [rad] of a wall's direction, beyond its own variance
 
 
 class Inputs(NamedTuple):
@@ -162,24 +155,6 @@ def init(config: Config, pose: Array, cov: Array | None = None) -> Belief:
         ValueError: The covariance is not symmetric and positive semi-definite.
     """
     return initial(pose, landmarks=config.landmarks, cov=cov)
-
-
-def sensor_noise(noise: Noise, nodes: Nodes, *, doubt: float = 1.0) -> Array:
-    """Covariance (M, 2, 2) of the features in range and bearing, or in direction (and 0).
-
-    Args:
-        noise: What the filter assumes.
-        nodes: Features of a scan.
-        doubt: Factor on the standard deviation of places that are not trusted.
-    """
-    own = jax.vmap(sensor.polar_cov)(nodes.xy, nodes.cov)
-    floor = jnp.diag(jnp.stack([noise.range, noise.bearing]) ** 2)
-    unsure = jnp.where(nodes.trusted, 1.0, doubt**2).astype(own.dtype)
-    point = (noise.scale**2 * own + floor[None]) * unsure[:, None, None]
-    wall = noise.scale**2 * nodes.variance + noise.wall**2
-    zero = jnp.zeros_like(wall)
-    wall = jnp.stack([jnp.stack([wall, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
-    return jnp.where((nodes.kind == WALL)[:, None, None], wall, point)
 
 
 def needed(config: Config, kind: Array) -> Array:
@@ -359,18 +334,3 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
         alike=config.matching.shape,
     )
     return Survey(belief, info, seen, graph)
-
-
-def wheel_noise(robot: Robot) -> Noise:
-    """Noise of a simulated robot: its encoders, and how well the front end finds landmarks."""
-    return _noise(wheel_coefficients(robot), range=0.002, bearing=0.001, scale=0.85, wall=0.0001)
-
-
-def log_noise() -> Noise:
-    """Noise for recorded logs of unknown robots: cautious."""
-    return _noise(jnp.full(4, 0.05), range=0.05, bearing=0.01, scale=1.5, wall=0.03)
-
-
-def _noise(odometry: Array, **rest: float) -> Noise:
-    odometry = jnp.asarray(odometry, float)
-    return Noise(odometry, **{name: jnp.asarray(value, float) for name, value in rest.items()})

@@ -22,7 +22,8 @@ from jaxslam.geometry import between, rotation, wrap_angle, wrap_line
 from jaxslam.linalg import inverse_root
 from jaxslam.motion import process_noise
 from jaxslam.nodes import restrict
-from jaxslam.slam import Inputs, Noise, sensor_noise
+from jaxslam.noise import Noise, sensor_noise
+from jaxslam.slam import Inputs
 from jaxslam.types import WALL, Array, expect
 
 FLOOR = 1e-4  # [m], [rad] std that is added to each motion: a robot that stands still has none

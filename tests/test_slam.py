@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from jaxslam import motion, slam
+from jaxslam import motion, recognition, slam
 from jaxslam.geometry import compose
 from jaxslam.monte_carlo import dead_reckoning
 from jaxslam.nodes import Nodes
@@ -22,6 +22,7 @@ FACING = np.array([0.0, 0.0, 0.0, 1.0, -2.0, 2.5, 0.0, 0.0])
 SHAPE = np.array([0.5, 1.0, 2.0, 1.5, 1.5, 4.7, 0.0, 0.0])
 MOTION = np.array([0.25, 0.0, 0.12])
 SMALL = CONFIG._replace(landmarks=5, kinds=(NODE, CORNER), confirm=1)
+MERGING = recognition.MatchSpec(margin=0.0)
 TRACED = []
 
 
@@ -249,3 +250,92 @@ def test_a_run_in_float32_is_close_to_float64(logs):
     assert double.used.any() and single.finite.all()
     np.testing.assert_allclose(single.pose, double.pose, atol=1e-5)
     np.testing.assert_allclose(single.pose_cov, double.pose_cov, atol=1e-7)
+
+
+def counters(info):
+    names = "fresh", "forgotten", "evicted", "merged"
+    return {name: int(n) for name in names if (n := getattr(info, name))}
+
+
+def test_a_step_counts_candidates_that_are_taken_in_and_forgotten():
+    _, told = drive(0, only=lambda t: [0, 1, 2] if t == 0 else [0, 1])
+    belief, events = start(), []
+    for t in range(5):
+        belief, info = stepped(CONFIG, NOISE, belief, at(told, t))
+        events.append(counters(info))
+    assert events == [{"fresh": 3}, {}, {}, {"forgotten": 1}, {}]
+
+
+def test_a_full_map_gives_up_idle_candidates_never_what_counts():
+    config = SMALL._replace(landmarks=3, confirm=2, idle=1, patience=40)
+    _, told = drive(0, only=lambda t: [0, 1, 2] if t < 1 else [0] if t < 3 else [0, 3, 4, 5])
+    belief, events = slam.init(config, jnp.zeros(3)), []
+    for t in range(5):
+        belief, info = stepped(config, NOISE, belief, at(told, t))
+        events.append(counters(info))
+    # Of three that ask for a slot two get one, and the next step finds none to give up.
+    assert events == [{"fresh": 3}, {}, {}, {"fresh": 2, "evicted": 2}, {}]
+    np.testing.assert_array_equal(belief.id, [0, 3, 4])
+    assert np.isfinite(belief.cov).all()
+
+
+def test_a_node_in_plain_sight_that_is_missed_is_forgotten():
+    config = SMALL._replace(misses=2, confirm=2)
+    # Node 2 is 4.1 m from where it is looked from; from within its circle, it cannot be missed.
+    wide = SHAPE[2] * 5
+    _, told = drive(0, only=lambda t: [0, 2] if t < 2 else [0])
+    shape = jnp.where(told.nodes.shape == SHAPE[2], wide, told.nodes.shape)
+    told = told._replace(nodes=told.nodes._replace(shape=shape))
+    belief, events = slam.init(config, jnp.zeros(3)), []
+    for t in range(5):
+        belief, info = stepped(config, NOISE, belief, at(told, t))
+        events.append(counters(info))
+    assert events == [{"fresh": 2}, {}, {}, {"forgotten": 1}, {}]
+    _, other = drive(0, only=lambda t: [0, 2] if t < 2 else [0])  # from outside it can
+    belief, _ = slam.run(config, NOISE, slam.init(config, jnp.zeros(3)), other)
+    np.testing.assert_array_equal(belief.id[belief.seen > 0], [0, 1])
+
+
+def test_two_landmarks_that_are_one_become_the_older():
+    config = SMALL._replace(confirm=1, matches=1)  # the one that is matched is looked at
+    _, told = drive(0, only=lambda t: [0])
+    belief, _ = stepped(config, NOISE, slam.init(config, jnp.zeros(3)), at(told, 0))
+    twin = belief.map_cov[:2, :2] + 1e-3 * jnp.eye(2)
+    belief = belief._replace(
+        mean=belief.mean.at[5:7].set(belief.mean[3:5] + jnp.array([0.03, 0.02])),
+        map_cov=belief.map_cov.at[2:4, 2:4].set(twin),
+        seen=belief.seen.at[1].set(1),
+        id=belief.id.at[1].set(7),
+        shape=belief.shape.at[1].set(belief.shape[0]),
+        next_id=jnp.int32(8),
+    )
+    before = np.trace(belief.map_cov[:2, :2])
+    belief, info = stepped(config._replace(matching=MERGING), NOISE, belief, at(told, 1))
+    assert counters(info) == {"merged": 1}
+    np.testing.assert_array_equal(belief.id[belief.seen > 0], [0])
+    assert np.trace(belief.map_cov[:2, :2]) < before
+
+
+def test_gradients_stay_finite_with_a_full_map_and_a_diverged_neighbour(logs):
+    config = SMALL._replace(landmarks=3, idle=0, confirm=2)
+    log_noise, unravel = ravel_pytree(jax.tree.map(jnp.log, NOISE))
+    inputs = jax.tree.map(lambda *x: jnp.stack(x), *[told for _, told in logs])
+    truth = jnp.stack([truth for truth, _ in logs])
+    broken = inputs._replace(motion=inputs.motion.at[1, 3].set(jnp.nan))
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, 0, 0))
+    def each(log_noise, told, truth):
+        def loss(log_noise):
+            noise = jax.tree.map(jnp.exp, unravel(log_noise))
+            _, info = slam.run(config, noise, slam.init(config, jnp.zeros(3)), told)
+            off = jnp.where(info.finite[:, None], (info.pose - truth)[:, :2], 0.0)
+            return jnp.mean(jnp.sum(off**2, axis=1)), info
+
+        return jax.value_and_grad(loss, has_aux=True)(log_noise)
+
+    (_, info), good = each(log_noise, inputs, truth)
+    _, bad = each(log_noise, broken, truth)
+    assert np.isfinite(good).all() and np.all(np.any(good != 0, axis=1))
+    assert (info.fresh.sum(axis=1) - info.evicted.sum(axis=1) <= 3).all()
+    np.testing.assert_array_equal(bad[jnp.array([0, 2])], good[jnp.array([0, 2])])

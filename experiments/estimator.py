@@ -29,6 +29,7 @@ from experiments.common import Numbers, scene
 from experiments.one_core import least, pin, seconds, unpin
 from experiments.workload import TOGETHER, Drive, Steps
 from jaxslam import monte_carlo, slam
+from jaxslam.kernel import one_kernel
 from jaxslam.lidar import cast
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
@@ -57,7 +58,7 @@ def track(std: Array, run: Drive) -> Array:
 @jax.jit
 def filtered(drive: Drive) -> Steps:
     """Filter B runs whose landmarks are all known, a few together."""
-    one = partial(workload.filter_one, "standard", grows=False)
+    one = partial(workload.filter_one, "standard", grows=False, wrap=one_kernel)
     return map_batches(one, drive, size=TOGETHER)
 
 

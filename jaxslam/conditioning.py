@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxslam.kernel import one_kernel
 from jaxslam.linalg import add_products, inverse_root
 from jaxslam.types import Array
 
@@ -116,11 +117,12 @@ def _seen(cov: Blocks, rows: Rows) -> tuple[Array, Array, Array]:
     seen = _of_slots(hm, slot)  # (N, M, 2)
     s = sum(hp[:, None, None, k] * rows.by_pose[None, ..., k] for k in range(3))
     s += sum(seen[:, :, None, k] * rows.by_slot[None, ..., k] for k in range(2))
-    index = jnp.arange(slot.size)
-    s = s.reshape(-1, 2, n // 2, 2).at[index, :, index].add(rows.noise).reshape(n, n)
-    return hp, hm, s
+    eye = jnp.eye(slot.size, dtype=s.dtype)[:, None, :, None]
+    s = s.reshape(-1, 2, n // 2, 2) + eye * rows.noise[:, :, None]
+    return hp, hm, s.reshape(n, n)
 
 
+@one_kernel
 def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     slot = rows.slot
     hp, hm, s = _seen(cov, rows)

@@ -1,5 +1,6 @@
 """Conditioning and its derivative, against the textbook's formulas and their derivatives."""
 
+import os
 from functools import partial
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam.conditioning import Blocks, Rows, condition
+from jaxslam.kernel import one_kernel
 
 L, M = 5, 3
 WEIGHT = np.random.default_rng(9).normal(size=(2, 3 + 2 * L, 3 + 2 * L))
@@ -114,3 +116,25 @@ def test_what_is_not_positive_definite_changes_nothing_and_its_neighbours_do_not
     assert np.isfinite(slope).all() and not slope[0].any() and slope[1].any()
     good = jax.jit(jax.vmap(lambda rows: condition(blocks(cov), rows).good))(both)
     np.testing.assert_array_equal(good, [False, True])
+
+
+def test_a_batch_of_conditionings_is_one_kernel_that_no_other_core_is_woken_for():
+    cov, rows = problem(0)
+    many = lambda x: jnp.stack([x] * 64)
+    cov, rows = jax.tree.map(many, (cov, rows))
+    compiled = jax.jit(jax.vmap(ours)).lower(cov, rows).compile()
+    entry = compiled.as_text().split("\nENTRY ")[1]
+    assert "xla_cpu_small_call" in entry and "outer_dimension_partitions" not in entry
+    # What is not one kernel is split on a machine of several cores.
+    plain = jax.jit(lambda x: jnp.sin(x) * x).lower(jnp.ones((1000, 1000))).compile().as_text()
+    if len(os.sched_getaffinity(0)) > 1:
+        assert "outer_dimension_partitions" in plain
+
+
+def test_one_kernel_gives_what_the_function_gives():
+    function = lambda x, y: {"sum": jnp.sum(x + y, axis=1), "most": jnp.max(x * y)}
+    x, y = np.random.default_rng(0).normal(size=(2, 300, 40))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12),
+        *(jax.jit(f)(x, y) for f in (one_kernel(function), function)),
+    )

@@ -7,10 +7,10 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 ORDER = (
-    "types linalg geometry world motion lidar grid voronoi tiles lines edges global_edges circles "
-    "nodes sensor noise junctions links alignment association belief conditioning ekf recognition "
-    "arrow ways topomap medial skeleton slam smoother plan metrics monte_carlo fit io plot report "
-    "cli"
+    "types kernel linalg geometry world motion lidar grid voronoi tiles lines edges global_edges "
+    "circles nodes sensor noise junctions links alignment association belief conditioning ekf "
+    "recognition arrow ways topomap medial skeleton slam smoother plan metrics monte_carlo fit io "
+    "plot report cli"
 ).split()
 DOORS = {"__init__", "__main__"}  # may import everything
 FILES = sorted(HOME.rglob("*.py"))

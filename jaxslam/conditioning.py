@@ -4,6 +4,7 @@ The covariance is kept in blocks, of the pose (3, 3), of pose and map (3, 2 L), 
 (2 L, 2 L), so that a motion leaves the largest of them alone and its rows stay aligned in memory.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -127,8 +128,8 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     slot = rows.slot
     hp, hm, s = _seen(cov, rows)
     root, logdet, good = inverse_root(s)
-    w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
-    good &= jnp.all(jnp.isfinite(w))
+    w = _mix(rows.residual.reshape(-1), root.T)
+    good &= reduce(jnp.logical_and, [jnp.isfinite(x) for x in w])
     root, w = lax.optimization_barrier((jnp.where(good, root, 0.0), jnp.where(good, w, 0.0)))
     y_pose = add_products(jnp.zeros_like(hp), root.T, hp)
     y_map = add_products(jnp.zeros_like(hm), root.T, hm)
@@ -141,7 +142,7 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
         jnp.moveaxis(_of_slots(after.cross, slot), 0, 2),
         after.map.reshape(hm.shape[1] // 2, 2, -1)[slot],
     )
-    result = Conditioned(shift, after, jnp.sum(w * w), logdet, good)
+    result = Conditioned(shift, after, _mix(w, w), logdet, good)
     return result, _Kept(root, y_pose, y_map, w, kept, rows)
 
 

@@ -15,9 +15,9 @@ def one_kernel(function: Callable) -> Callable:
     for it. Where operations take microseconds, that is several times slower than one core is.
     Elsewhere than on a CPU nothing changes.
 
-    Such a kernel cannot hold a scatter, a sort, a cumulative sum or a matrix product: they do not
-    compile. Nor can that of a derivative, where a gather becomes a scatter: it is for what has a
-    derivative by hand, or none.
+    Such a kernel cannot hold a scatter, a sort, a matrix product or a reduction of many numbers:
+    they do not compile. Nor can that of a derivative, where a gather becomes a scatter. It is for
+    what has a derivative by hand, or none.
     """
     own = jax.jit(function)
 

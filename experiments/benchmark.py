@@ -140,6 +140,7 @@ def compute(seed: int, runs: int, maps: int, drives: int, repeats: int) -> commo
 def draw(numbers: common.Numbers, path: Path) -> None:
     """Bars: time of each part of the chain and of the front end; peers of automaton and filter."""
     figure, axes = common.canvas(11, 8.4, 3, 2)
+    figure.suptitle("one core", fontsize=10)
     of = numbers["front_end"]
     bars(axes[0, 0], numbers["chain"]["ms_per_scan"], "%.2f", "chain: milliseconds a scan")
     bars(axes[0, 1], of["ms_per_scan"], "%.3f", "front end: milliseconds a scan")
@@ -150,10 +151,11 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     batch = {name: row["ms_in_batch"] for name, row in rows.items()}
     bars(axes[1, 1], batch, "%.3g", f"batch of {of['batch']}: milliseconds a map")
     steps = {kind: filters.per_step(numbers["estimator"], kind) for kind in ("filter", "gradient")}
-    bars(axes[2, 0], steps["filter"], "%.3g", "filter: microseconds a step of a run, in a batch")
-    bars(axes[2, 1], steps["gradient"], "%.3g", "value and gradient: microseconds a step of a run")
+    bars(axes[2, 0], steps["filter"], "%.3g", "filter: microseconds a step of a run")
+    bars(axes[2, 1], steps["gradient"], "%.3g", "value and gradient: microseconds a step")
     for axis in (axes[1, 1], *axes[2]):
         axis.set_xscale("log")
+        axis.minorticks_off()
         axis.margins(x=0.25)
     figure.savefig(path)
 
@@ -164,9 +166,9 @@ def bars(axis: Any, values: dict[str, float], form: str, title: str) -> None:
     drawn = axis.barh([n.replace("_", " ") for n in names], [values[n] for n in names])
     for bar in drawn:
         bar.set_color(common.SKY)
-    axis.bar_label(drawn, fmt=form, padding=2)
+    axis.bar_label(drawn, fmt=lambda x: f"{x:,.0f}" if x > 100 else form % x, padding=2)
     axis.margins(x=0.15)
-    axis.set_title(title + ", one core", fontsize=10)
+    axis.set_title(title, fontsize=10)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -256,7 +256,14 @@ def precision(seed: int, runs: int, beside: int, logs: str) -> Numbers:
     return told | {"max_difference_f64_m": farthest(theirs, double[:beside])}
 
 
-TASKS = {"memory": memory, "devices": devices, "precision": precision}
+def others(seed: int) -> Numbers:
+    """Figures of other libraries; NumPy's threads, too, are to be as many as there are cores."""
+    some = workload.rings(seed, filters.BATCH)
+    short = {k: getattr(some, k)[:, :25] for k in ("truth", "motion", "polar", "who", "r")}
+    return filters.table(workload.as_floats(some._replace(**short)))
+
+
+TASKS = {"memory": memory, "devices": devices, "precision": precision, "others": others}
 
 
 def apart(task: str, kept: str, *, devices: int = 1, **arguments: Any) -> Numbers:
@@ -284,8 +291,6 @@ def apart(task: str, kept: str, *, devices: int = 1, **arguments: Any) -> Number
 
 def compute(seed: int, runs: int, repeats: int, office: int) -> Numbers:
     """All figures, on B runs of the rings, and on some of the office drive."""
-    some = workload.rings(seed, filters.BATCH)
-    short = {k: getattr(some, k)[:, :25] for k in ("truth", "motion", "polar", "who", "r")}
     numbers = speed(seed, runs, repeats)
     of_step, logs = latency(seed, office)
     with tempfile.TemporaryDirectory() as folder:
@@ -293,7 +298,7 @@ def compute(seed: int, runs: int, repeats: int, office: int) -> Numbers:
         np.savez(file, *jax.tree.leaves(logs))
         numbers |= gradient_memory(folder, seed, runs) | two_devices(folder, seed, runs, repeats)
         numbers |= of_step | apart("precision", folder, seed=seed, runs=runs, beside=4, logs=file)
-    return numbers | {"peers": filters.table(workload.as_floats(some._replace(**short)))}
+        return numbers | {"peers": apart("others", folder, seed=seed)}
 
 
 if __name__ == "__main__":

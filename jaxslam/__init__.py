@@ -2,7 +2,18 @@
 
 from importlib import metadata as _metadata
 
-from jaxslam import ekf, lidar, metrics, monte_carlo, plan, slam, topomap, world
+from jaxslam import (
+    association,
+    ekf,
+    lidar,
+    metrics,
+    monte_carlo,
+    plan,
+    slam,
+    smoother,
+    topomap,
+    world,
+)
 from jaxslam.belief import Belief
 from jaxslam.grid import GridSpec
 from jaxslam.lidar import Lidar, Scan
@@ -28,12 +39,14 @@ __all__ = [
     "Robot",
     "Scan",
     "World",
+    "association",
     "ekf",
     "lidar",
     "metrics",
     "monte_carlo",
     "plan",
     "slam",
+    "smoother",
     "topomap",
     "world",
 ]

@@ -7,6 +7,7 @@ import pytest
 import reference_filter
 from scipy.optimize import least_squares
 
+from experiments import smoothing
 from jaxslam import association, motion, nodes, slam, smoother
 from jaxslam.types import CORNER, NODE, WALL
 
@@ -288,3 +289,10 @@ def test_wrong_shapes_are_told():
     given = slam.Inputs(records.motion, seen)
     with pytest.raises(ValueError, match=r"which is int32 \(12, 4\), not"):
         smoother.records(slam.log_noise(), START, given, records.which[:, :4])
+
+
+def test_on_drives_past_known_landmarks_it_leaves_less_error_than_the_filter():
+    told = smoothing.compute(0, runs=16)
+    gain = np.log(told["filter"]["position_rmse_m"] / told["smoother"]["position_rmse_m"])
+    assert gain > 2 / np.sqrt(2 * 16)  # two standard errors, were each run one independent error
+    assert told["runs_better"] > 0.5 and len(told["filter"]["position_rmse_by_step_m"]) == 200

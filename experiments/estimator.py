@@ -29,7 +29,6 @@ from experiments.common import Numbers, scene
 from experiments.one_core import least, pin, seconds, unpin
 from experiments.workload import TOGETHER, Drive, Steps
 from jaxslam import monte_carlo, slam
-from jaxslam.kernel import one_kernel
 from jaxslam.lidar import cast
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
@@ -58,7 +57,7 @@ def track(std: Array, run: Drive) -> Array:
 @jax.jit
 def filtered(drive: Drive) -> Steps:
     """Filter B runs whose landmarks are all known, a few together."""
-    one = partial(workload.filter_one, "standard", grows=False, wrap=one_kernel)
+    one = partial(workload.filter_one, "standard", grows=False)
     return map_batches(one, drive, size=TOGETHER)
 
 

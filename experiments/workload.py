@@ -5,7 +5,6 @@
 filtering on manifolds"), whose robot sees two or three of twenty landmarks at a time.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -162,13 +161,8 @@ def _start(linearisation: str, run: Drive) -> Belief:
     return belief._replace(seen=jnp.where(given, 1, 0).astype(jnp.int32))
 
 
-def filter_one(
-    linearisation: str, run: Drive, *, grows: bool = True, wrap: Callable = lambda body: body
-) -> Steps:
-    """Filter one run, known association; what is seen first is taken in, if the map `grows`.
-
-    `wrap` is given the function of a step.
-    """
+def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:
+    """Filter one run, known association; what is seen first is taken in, if the map `grows`."""
     how = {"linearisation": linearisation}
     size = run.prior.shape[0]
 
@@ -187,7 +181,7 @@ def filter_one(
         return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, -0.5 * density)
 
     data = run.motion, run.polar, run.who, run.r
-    return lax.scan(wrap(body), _start(linearisation, run), data)[1]
+    return lax.scan(body, _start(linearisation, run), data)[1]
 
 
 @partial(jax.jit, static_argnums=0)

@@ -3,8 +3,6 @@
 No LAPACK: programs that call it can hang when several run at once on the threads of one CPU.
 """
 
-from functools import reduce
-
 import jax.numpy as jnp
 from jax import lax
 
@@ -52,8 +50,9 @@ def inverse_root(s: Array) -> tuple[Array, Array, Array]:
             rows.append(second[n - k :])
             left = left[2:, 2:] - first[2 : n - k, None] * first[None, 2:]
             left -= second[2 : n - k, None] * second[None, 2:]
-    good = reduce(jnp.logical_and, [(pivot > 0.0) & jnp.isfinite(pivot) for pivot in pivots])
-    logdet = sum(jnp.log(jnp.where(good, pivot, 1.0)) for pivot in pivots)
+    pivot = jnp.stack(pivots)
+    good = jnp.all(pivot > 0.0) & jnp.all(jnp.isfinite(pivot))
+    logdet = jnp.sum(jnp.log(jnp.where(good, pivot, 1.0)))
     return jnp.where(good, jnp.stack(rows), 0.0), logdet, good
 
 

@@ -1,17 +1,13 @@
 """Conditioning and its derivative, against the textbook's formulas and their derivatives."""
 
-import os
-import re
 from functools import partial
 
 import jax
-import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxslam.conditioning import Blocks, Rows, condition
-from jaxslam.kernel import one_kernel
 
 L, M = 5, 3
 WEIGHT = np.random.default_rng(9).normal(size=(2, 3 + 2 * L, 3 + 2 * L))
@@ -118,38 +114,3 @@ def test_what_is_not_positive_definite_changes_nothing_and_its_neighbours_do_not
     assert np.isfinite(slope).all() and not slope[0].any() and slope[1].any()
     good = jax.jit(jax.vmap(lambda rows: condition(blocks(cov), rows).good))(both)
     np.testing.assert_array_equal(good, [False, True])
-
-
-def test_a_batch_of_conditionings_is_one_kernel_that_no_other_core_is_woken_for():
-    cov, rows = problem(0)
-    many = lambda x: jnp.stack([x] * 64)
-    cov, rows = jax.tree.map(many, (cov, rows))
-    compiled = jax.jit(jax.vmap(ours)).lower(cov, rows).compile()
-    entry = compiled.as_text().split("\nENTRY ")[1]
-    assert "xla_cpu_small_call" in entry and "outer_dimension_partitions" not in entry
-    # What is not one kernel is split on a machine of several cores.
-    plain = jax.jit(lambda x: jnp.sin(x) * x).lower(jnp.ones((1000, 1000))).compile().as_text()
-    if len(os.sched_getaffinity(0)) > 1:
-        assert "outer_dimension_partitions" in plain
-
-
-def primitives(jaxpr):
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for inner in jax.extend.core.jaxprs_in_params(equation.params):
-            yield from primitives(inner)
-
-
-def test_a_kernel_of_conditioning_holds_nothing_that_it_cannot():
-    names = set(primitives(jax.make_jaxpr(condition)(blocks(problem(0)[0]), problem(0)[1]).jaxpr))
-    assert "gather" in names and "mul" in names
-    assert not re.search("scatter|sort|dot_general|conv_|reduce|cum|arg", " ".join(names)), names
-
-
-def test_one_kernel_gives_what_the_function_gives():
-    function = lambda x, y: {"sum": jnp.sin(x) + y, "less": x[::-1] < y}
-    x, y = np.random.default_rng(0).normal(size=(2, 300, 40))
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12),
-        *(jax.jit(f)(x, y) for f in (one_kernel(function), function)),
-    )

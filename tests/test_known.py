@@ -1,5 +1,7 @@
 """The filter with known association: a sensor that tells which landmark it sees."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,9 @@ import pytest
 import reference_filter
 from reference_filter import DenseSlam
 
-from jaxslam import motion, nodes, slam
+from experiments import workload
+from jaxslam import ekf, motion, nodes, slam
+from jaxslam.belief import initial
 from jaxslam.slam import Config, Inputs
 from jaxslam.types import NODE
 
@@ -122,3 +126,44 @@ def test_wrong_shapes_are_told():
         nodes.from_polar(jnp.zeros((5, 3)), jnp.zeros(5, bool))
     with pytest.raises(ValueError, match="valid is .*, not"):
         nodes.from_polar(jnp.zeros((5, 2)), jnp.zeros(4, bool))
+
+
+@pytest.mark.parametrize("linearisation", ["standard", "invariant"])
+def test_the_covariance_stays_positive_definite_over_50_000_steps_in_float32(linearisation):
+    steps, count, most, how = 50_000, 16, 4, {"linearisation": linearisation}
+    rng = np.random.default_rng(0)
+    true = np.tile([0.25, 0.0, 0.05], (1, steps, 1))
+    truth = workload.driven(np.zeros((1, 3)), true)
+    angle = 2 * np.pi * np.arange(count) / count
+    places = rng.uniform(3, 7.5, (count, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
+    away, bearing, who = workload.nearest(truth, places[None] + [0, 5.0], (0.4, 6.0), most)
+    polar = np.stack([away, bearing], -1)[0] + rng.normal(size=(steps, most, 2)) * [0.1, 0.03]
+    told = true[0] + rng.normal(size=(steps, 3)) * [0.02, 0.02, 0.01]
+    who = np.where(polar[..., 0] > 0.4, who[0], -1)
+    q = jnp.diag(jnp.array([0.02, 0.02, 0.01], jnp.float32) ** 2)
+    r = jnp.tile(jnp.diag(jnp.array([0.1, 0.03], jnp.float32) ** 2), (most, 1, 1))
+
+    def step(now, given):
+        motion, polar, who = given
+        now, seen = ekf.predict(now, motion, q, **how), nodes.from_polar(polar, who >= 0)
+        known = (who >= 0) & (now.seen.at[who].get(mode="fill", fill_value=0) > 0)
+        rows = ekf.innovations(now, seen, r, jnp.where(known, who, count), **how)
+        now, done = ekf.update(now, rows, **how)
+        at = jnp.where(who >= 0, who, count)
+        now, _ = ekf.augment(now, seen, r, (who >= 0) & ~known, most=most, at=at, **how)
+        return now, (now.pose, done.good)
+
+    def thousand(now, given):
+        now, told = jax.lax.scan(step, now, given)
+        return now, (now.cov, *told)
+
+    given = jnp.asarray(told, jnp.float32), jnp.asarray(polar, jnp.float32), jnp.asarray(who)
+    given = jax.tree.map(lambda x: x.reshape((-1, 1000) + x.shape[1:]), given)
+    first = initial(jnp.zeros(3, jnp.float32), landmarks=count)
+    _, (cov, pose, good) = jax.jit(partial(jax.lax.scan, thousand))(first, given)
+    assert cov.dtype == jnp.float32 and good.all()
+    cov = np.asarray(cov, float)
+    np.testing.assert_allclose(cov, cov.swapaxes(1, 2), rtol=0, atol=1e-6)
+    std = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    assert np.linalg.eigvalsh(cov / std[:, :, None] / std[:, None]).min() > 1e-4
+    assert np.abs(np.asarray(pose).reshape(-1, 3) - truth[0])[:, :2].max() < 0.6

@@ -3,7 +3,6 @@
 from importlib import metadata as _metadata
 
 from jaxslam import (
-    association,
     ekf,
     lidar,
     metrics,
@@ -39,7 +38,6 @@ __all__ = [
     "Robot",
     "Scan",
     "World",
-    "association",
     "ekf",
     "lidar",
     "metrics",

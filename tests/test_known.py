@@ -128,9 +128,8 @@ def test_wrong_shapes_are_told():
         nodes.from_polar(jnp.zeros((5, 2)), jnp.zeros(4, bool))
 
 
-@pytest.mark.parametrize("linearisation", ["standard", "invariant"])
-def test_the_covariance_stays_positive_definite_over_50_000_steps_in_float32(linearisation):
-    steps, count, most, how = 50_000, 16, 4, {"linearisation": linearisation}
+def test_the_covariance_stays_positive_definite_over_50_000_steps_in_float32():
+    steps, count, most, how = 50_000, 16, 4, {"linearisation": "invariant"}
     rng = np.random.default_rng(0)
     true = np.tile([0.25, 0.0, 0.05], (1, steps, 1))
     truth = workload.driven(np.zeros((1, 3)), true)

@@ -43,6 +43,7 @@ class Steps(NamedTuple):
     nis: Array  # (T,)
     dof: Array  # (T,) int32
     log_likelihood: Array  # (T,)
+    good: Array  # (T,) bool, False where the update had to be left out
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
@@ -161,25 +162,37 @@ def _start(linearisation: str, run: Drive) -> Belief:
     return belief._replace(seen=jnp.where(given, 1, 0).astype(jnp.int32))
 
 
-def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:
-    """Filter one run, known association; what is seen first is taken in, if the map `grows`."""
+def step(
+    linearisation: str, q: Array, belief: Belief, now: tuple[Array, ...], *, grows: bool = True
+) -> tuple[Belief, Steps]:
+    """One step, known association; what is seen first is taken in, if the map `grows`.
+
+    Args:
+        linearisation: One of `ekf.LINEARISATIONS`.
+        q: (3, 3) covariance of the odometry.
+        belief: After the step before.
+        now: Odometry (3,), range and bearing (M, 2), whose they are (M,), covariances (M, 2, 2).
+        grows: Whether there are landmarks that are not known beforehand.
+    """
     how = {"linearisation": linearisation}
-    size = run.prior.shape[0]
+    motion, polar, who, r = now
+    size = belief.seen.size
+    belief = ekf.predict(belief, motion, q, **how)
+    features = from_polar(polar, who >= 0)
+    known = (who >= 0) & (belief.seen.at[who].get(mode="fill", fill_value=0) > 0)
+    rows = ekf.innovations(belief, features, r, jnp.where(known, who, size), **how)
+    belief, done = ekf.update(belief, rows, **how)
+    if grows:
+        new, at = (who >= 0) & ~known, jnp.where(who >= 0, who, size)
+        belief, _ = ekf.augment(belief, features, r, new, most=who.size, at=at, **how)
+    dof = 2 * jnp.sum(known, dtype=jnp.int32)
+    density = done.nis + done.logdet + dof.astype(r.dtype) * jnp.log(2 * jnp.pi).astype(r.dtype)
+    return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, -0.5 * density, done.good)
 
-    def body(belief: Belief, now: tuple[Array, ...]) -> tuple[Belief, Steps]:
-        motion, polar, who, r = now
-        belief = ekf.predict(belief, motion, run.q, **how)
-        features = from_polar(polar, who >= 0)
-        known = (who >= 0) & (belief.seen.at[who].get(mode="fill", fill_value=0) > 0)
-        rows = ekf.innovations(belief, features, r, jnp.where(known, who, size), **how)
-        belief, done = ekf.update(belief, rows, **how)
-        if grows:
-            new, at = (who >= 0) & ~known, jnp.where(who >= 0, who, size)
-            belief, _ = ekf.augment(belief, features, r, new, most=who.size, at=at, **how)
-        dof = 2 * jnp.sum(known, dtype=jnp.int32)
-        density = done.nis + done.logdet + dof.astype(r.dtype) * jnp.log(2 * jnp.pi).astype(r.dtype)
-        return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, -0.5 * density)
 
+def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:
+    """Filter one run by `step`."""
+    body = partial(step, linearisation, run.q, grows=grows)
     data = run.motion, run.polar, run.who, run.r
     return lax.scan(body, _start(linearisation, run), data)[1]
 

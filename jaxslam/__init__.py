@@ -2,17 +2,7 @@
 
 from importlib import metadata as _metadata
 
-from jaxslam import (
-    ekf,
-    lidar,
-    metrics,
-    monte_carlo,
-    plan,
-    slam,
-    smoother,
-    topomap,
-    world,
-)
+from jaxslam import ekf, lidar, metrics, monte_carlo, plan, slam, smoother, topomap, world
 from jaxslam.belief import Belief
 from jaxslam.grid import GridSpec
 from jaxslam.lidar import Lidar, Scan

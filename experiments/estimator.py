@@ -41,6 +41,8 @@ LIMIT = 240.0  # [s] for a process of its own
 CALLS = 60  # steps and scans of which latency is the median
 STD = np.array(filters.STD, np.float32)  # the true noise
 DEVICES = "--xla_force_host_platform_device_count"
+# XLA splits operations among the threads of all devices, which each is to leave to the others.
+WHOLE = "--xla_disable_hlo_passes=cpu-parallel-task-assigner"
 
 
 def assumed(std: Array, run: Drive) -> Drive:
@@ -275,7 +277,8 @@ def apart(task: str, kept: str, *, devices: int = 1, **arguments: Any) -> Number
         arguments: Of the task.
     """
     flags = [f for f in os.environ.get("XLA_FLAGS", "").split() if not f.startswith(DEVICES)]
-    own = os.environ | {"XLA_FLAGS": " ".join([*flags, f"{DEVICES}={devices}"])}
+    whole = [WHOLE] if devices > 1 else []
+    own = os.environ | {"XLA_FLAGS": " ".join([*flags, f"{DEVICES}={devices}", *whole])}
     own |= {"JAX_ENABLE_X64": "0", "JAX_COMPILATION_CACHE_DIR": kept}
     command = [sys.executable, "-m", "experiments.estimator", task, json.dumps(arguments)]
     run = partial(subprocess.run, cwd=ROOT, capture_output=True, text=True)

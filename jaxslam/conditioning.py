@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxslam.linalg import add_products, inverse_root
@@ -155,8 +156,8 @@ def _guard(rows: Rows, good: Array, map: Array) -> Array:
     learns nothing more: each loses half a unit of rounding.
     """
     seen = good & jnp.any(rows.by_slot != 0.0)
-    more = jnp.where(seen, GUARD * jnp.finfo(map.dtype).eps, 0.0).astype(map.dtype)
-    return 1 + more * jnp.eye(len(map), dtype=map.dtype)
+    raised = 1 + GUARD * np.finfo(map.dtype).eps * np.eye(len(map))  # a constant: half the cost
+    return jnp.where(seen, raised.astype(map.dtype), jnp.ones((), map.dtype))
 
 
 def _mix(weight: Array, rows: Array) -> Array:

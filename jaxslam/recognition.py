@@ -30,8 +30,9 @@ class MatchSpec(NamedTuple):
     wall_apart: float = 0.26  # [rad] likewise between wall directions
     shape: float = 0.3  # logarithm of the ratio of clearances
     turn: float = 0.5  # [rad] between directions of corners
-    witness: float = 0.5  # [m] least distance of a pair that vouches for another
-    looks: int = 2  # scans in a row in which a place is met again without a witness
+    lost: float = 0.3  # [m] standard deviation above which a place is believed only if there is
+    witness: float = 0.5  # [m] another pair at least so far off that agrees, or after
+    looks: int = 2  # scans in a row in which it is met
 
 
 class Recognised(NamedTuple):
@@ -149,7 +150,7 @@ def second_look(
 
     spread = s.reshape(m, 2, m, 2)[index, :, index] - rows.noise
     far2 = jnp.sum(nodes.xy**2, axis=1)
-    doubtful = place & (spread[:, 0, 0] + far2 * spread[:, 1, 1] > spec.apart**2)
+    doubtful = place & (spread[:, 0, 0] + far2 * spread[:, 1, 1] > spec.lost**2)
 
     apart = lambda xy: jnp.sqrt(
         (xy[:, None, 0] - xy[None, :, 0]) ** 2 + (xy[:, None, 1] - xy[None, :, 1]) ** 2 + 1e-6

@@ -1,11 +1,14 @@
 import os
 from pathlib import Path
 
-# Most of the time of these tests is XLA's optimiser, and what they run is small.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+import jax
+import pytest
 
-import jax  # noqa: E402, as the flag must be set first
-import pytest  # noqa: E402
+# Most of the time of these tests is XLA's compiler, and what they run is small. The old emitters
+# take half of its time; they may go with a next version, and an unknown flag ends the process.
+FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+OLD = " --xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
+os.environ.setdefault("XLA_FLAGS", FLAGS + OLD)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -17,17 +17,16 @@ from jaxslam import cli, geometry, lidar, metrics, world
 from jaxslam.io import carmen, tum
 
 # The commands run in processes of their own, in float32 as users run them; a short drive and
-# hardly optimised programs keep them quick.
+# hardly optimised programs (`conftest`) keep them quick.
 FIRST_LEGS = "from jaxslam import world; world.DRIVES['office'] = world.DRIVES['office'][:3]; "
 MAIN = "import sys; from jaxslam import cli; sys.exit(cli.main(sys.argv[1:]))"
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 SCANS = 24
 PICTURES = ("path.png", "errors.png")
 
 
 def begin(*arguments, cache):
     """Start the command line in a process of its own."""
-    own = {"XLA_FLAGS": QUICK, "XDG_CACHE_HOME": str(cache)}
+    own = {"XDG_CACHE_HOME": str(cache)}
     keep = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     return subprocess.Popen(
         [sys.executable, "-c", FIRST_LEGS + MAIN, *map(str, arguments)],

@@ -1,9 +1,12 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 
-from experiments import fig02_expansion, fig06_local
+from experiments import fig02_expansion, fig06_local, fig09_global
+from experiments.room_graph import reference
+from jaxslam import world
 
 
 def test_figure_2_is_written_and_equals_the_paper(tmp_path, monkeypatch):
@@ -37,3 +40,12 @@ def test_both_labels_keep_what_the_paper_says_of_corridors():
     for mode, of_mode in told.items():
         assert {type(x) for x in of_mode.values()} == {bool, float}
         assert all(x for x in of_mode.values() if isinstance(x, bool)), (mode, of_mode)
+
+
+def test_ten_scans_of_a_room_give_the_voronoi_graph_of_its_walls():
+    """Figures 8 and 9, with a draw of the noise that the picture is not of."""
+    places, walls = world.places(fig09_global.WORLD), world.named(fig09_global.WORLD).walls
+    maps, _, _ = fig09_global.explore(places, np.asarray(walls), seed=3)
+    result = fig09_global.compare(maps[-1], reference(np.asarray(walls)))
+    assert fig09_global.equal(result), result
+    assert result["worst_node_error_m"] < fig09_global.NEAR

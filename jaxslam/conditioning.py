@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jaxslam.linalg import add_products, inverse_root
 from jaxslam.types import Array
@@ -117,7 +116,6 @@ def _seen(cov: Blocks, rows: Rows) -> tuple[Array, Array, Array]:
     own = cov.map.reshape(-1, 2, cov.map.shape[1])[slot]  # (M, 2, 2 L)
     hp = (_times(rows.by_pose, cov.pose[None]) + _times(rows.by_slot, across)).reshape(n, 3)
     hm = (_times(rows.by_pose, cov.cross[None]) + _times(rows.by_slot, own)).reshape(n, -1)
-    hp, hm = lax.optimization_barrier((hp, hm))
     seen = _of_slots(hm, slot)  # (N, M, 2)
     s = sum(hp[:, None, None, k] * rows.by_pose[None, ..., k] for k in range(3))
     s += sum(seen[:, :, None, k] * rows.by_slot[None, ..., k] for k in range(2))
@@ -132,10 +130,9 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     root, logdet, good = inverse_root(s)
     w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
     good &= jnp.all(jnp.isfinite(w))
-    root, w = lax.optimization_barrier((jnp.where(good, root, 0.0), jnp.where(good, w, 0.0)))
+    root, w = jnp.where(good, root, 0.0), jnp.where(good, w, 0.0)
     y_pose = add_products(jnp.zeros_like(hp), root.T, hp)
     y_map = add_products(jnp.zeros_like(hm), root.T, hm)
-    y_pose, y_map = lax.optimization_barrier((y_pose, y_map))
     after = plus(cov, (y_pose, y_map), (y_pose, y_map), sign=-1)
     after = after._replace(map=after.map * _guard(rows, good, after.map))
     shift = jnp.concatenate([_mix(w, y_pose), _mix(w, y_map)])
@@ -188,20 +185,16 @@ def _pull(kept: _Kept, out: Conditioned) -> tuple[Blocks, Rows]:
     map = out.cov.map
 
     k = lambda x: add_products(jnp.zeros_like(x), root, x)  # A^T x
-    other = lax.optimization_barrier(map @ ym.T)
-    e_map = (ym @ map + other.T) / 2 + add_products(jnp.zeros_like(ym), yp.T, cross)
+    e_map = (ym @ map + (map @ ym.T).T) / 2 + add_products(jnp.zeros_like(ym), yp.T, cross)
     e_pose = yp @ pose + ym @ cross.T
     q_pose, q_map, k_pose, k_map = k(e_pose), k(e_map), k(yp), k(ym)
-    q_pose, q_map, k_pose, k_map = lax.optimization_barrier((q_pose, q_map, k_pose, k_map))
     u = jnp.sum(root * w[:, None], axis=0)
     r = k_pose @ g_pose + k_map @ g_map
     shift = jnp.concatenate([_mix(w, yp), _mix(w, ym)])
     by_v = r + 2 * nis * u
-    u, by_v = lax.optimization_barrier((u, by_v))
     by_s = q_pose @ k_pose.T + q_map @ k_map.T - nis * u[:, None] * u[None]
     by_s -= (r[:, None] * u[None] + u[:, None] * r[None]) / 2
     by_s += logdet * k(root)
-    by_s = lax.optimization_barrier(by_s)
 
     # X, but for the part N H / 2 in the columns of the slots.
     hs = by_s.reshape(n, m, 2)
@@ -210,7 +203,6 @@ def _pull(kept: _Kept, out: Conditioned) -> tuple[Blocks, Rows]:
     x_map = u[:, None] * g_map[None] / 2 - q_map
     part = sum(hs[:, :, i, None] * rows.by_slot[None, :, i] for i in range(2)) / 2  # (N, M, 2)
     x_map = x_map.reshape(n, size, 2).at[:, rows.slot].add(part).reshape(n, -1)
-    x_pose, x_map = lax.optimization_barrier((x_pose, x_map))
     # H^T X: rows of the pose, and of the slots that were seen.
     flat = rows.by_pose.reshape(n, 3)
     x_slot = x_pose.reshape(m, 2, 3), x_map.reshape(m, 2, -1)

@@ -8,22 +8,15 @@ from jax import lax
 
 from jaxslam.types import Array
 
-TOGETHER = 4  # outer products that are summed in one pass
-
 
 def add_products(start: Array, left: Array, right: Array, *, sign: int = 1) -> Array:
     """`start` (a, b) plus or minus left^T right, for left (n, a) and right (n, b).
 
-    A few outer products at a time: such a sum is one vectorised loop over the result, which takes
-    half the time of a batched matrix product of this size. More at a time spill registers, and
-    without the barriers the compiler puts all of them together.
+    A sum of outer products is one vectorised loop over the result, which takes half the time of a
+    batched matrix product of this size.
     """
-    for first in range(0, len(left), TOGETHER):
-        start = lax.optimization_barrier(start) if first else start
-        for u, v in zip(
-            left[first : first + TOGETHER], right[first : first + TOGETHER], strict=True
-        ):
-            start = start + u[:, None] * v[None] if sign > 0 else start - u[:, None] * v[None]
+    for u, v in zip(left, right, strict=True):
+        start = start + u[:, None] * v[None] if sign > 0 else start - u[:, None] * v[None]
     return start
 
 

@@ -35,12 +35,14 @@ def padded(path: np.ndarray) -> tuple[jnp.ndarray, jnp.ndarray]:
 
 @partial(jax.jit, static_argnames="robot")
 def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief, arcs):
-    """Follow `path` by the belief, from a true pose (3,); all scans are of where the robot is."""
+    """Look around, then follow `path` by the belief, from a true pose (3,)."""
 
-    def step(now, key):
+    def step(now, given):
         truth, belief, arcs, at = now
+        key, moves = given
         roll_key, scan_key = jax.random.split(key)
         told, at = plan.follow(path, at, belief.pose)
+        told = jnp.where(moves, told, 0.0)
         draws = jax.random.normal(roll_key, (monte_carlo.SUBSTEPS, 2), path.dtype)
         truth = compose(truth, motion.roll(robot, draws, told))
         scan = lidar.disturb(scan_key, lidar.cast(place, truth, CONFIG.lidar), CONFIG.lidar)
@@ -50,21 +52,25 @@ def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief,
         return (truth, belief, arcs, at), (truth, told, info)
 
     start = (truth, belief, arcs, begin)
-    (truth, belief, arcs, _), (truths, told, info) = jax.lax.scan(
-        step, start, jax.random.split(key, STEPS)
-    )
+    each = jax.random.split(key, STEPS), jnp.arange(STEPS) > 0
+    (truth, belief, arcs, _), (truths, told, info) = jax.lax.scan(step, start, each)
     return truth, belief, arcs, truths, told, info
 
 
-def way_home(graph: topomap.Graph, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Shortest way (K, 2) from `start` (2,) to `goal` (2,) over the largest part of the map."""
+def way_home(graph: topomap.Graph, trail: np.ndarray) -> np.ndarray:
+    """Shortest way (K, 2) back to where a trail (T, 2) began, over the largest part of the map.
+
+    What lies between the map and the ends of the trail is known to be free along the trail alone.
+    """
     size = len(graph.xy)
     joined = coo_matrix((np.ones(len(graph.pairs)), graph.pairs.T), shape=(size, size))
     part = connected_components(joined, directed=False)[1]
     nodes = np.flatnonzero(part == np.argmax(np.bincount(part)))
-    nearest = lambda place: nodes[np.argmin(np.linalg.norm(graph.xy[nodes] - place, axis=1))]
-    way = plan.route(graph, nearest(start), nearest(goal))
-    return np.array([start, *way.line, goal])
+    away = np.linalg.norm(trail[:, None] - graph.xy[nodes], axis=2)
+    met = np.flatnonzero(np.any(away < graph.clearance[nodes], axis=1))  # nothing is in a circle
+    node = lambda t: nodes[np.argmin(np.where(away[t] < graph.clearance[nodes], away[t], np.inf))]
+    way = plan.route(graph, node(met[-1]), node(met[0]))
+    return np.concatenate([trail[: met[-1] - 1 : -1], way.line, trail[met[0] :: -1]])
 
 
 def clearance(walls: np.ndarray, places: np.ndarray) -> float:
@@ -90,7 +96,7 @@ def compute(seed: int) -> common.Numbers:
             key, robot, place, noise, *padded(path), truth, belief, arcs
         )
         still = np.all(np.asarray(told) == 0.0, axis=1)
-        moved = int(np.argmax(still)) if still.any() else STEPS  # it stops at the end of its path
+        moved = 1 + int(np.argmax(still[1:])) if still[1:].any() else STEPS  # at the path's end
         cut = lambda tree: jax.tree.map(lambda x: x[:moved], tree)  # noqa: B023
         truths, told, info = cut((truths, told, info))
         odometry = monte_carlo.dead_reckoning(blind, told)
@@ -114,8 +120,7 @@ def compute(seed: int) -> common.Numbers:
         poses = np.concatenate([np.asarray(one["estimate"]) for one in legs])
         graph = topomap.graph(belief, arcs, poses, confirm=CONFIG.confirm)
         if name == "out":
-            goal = np.asarray(tour, float)[0]
-            path = plan.densify(way_home(graph, np.asarray(belief.pose, float)[:2], goal))
+            path = plan.densify(way_home(graph, poses[:, :2]))
         blind = odometry[-1]
     return {"seed": seed, "legs": legs, "map": graph._asdict(), "walls": walls}
 

@@ -78,7 +78,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
         noise.plot([], color=colour, label=name)
     noise.axhline(1.0, color=common.PINK, linestyle="--")
     noise.set(xlabel="step", ylabel="noise / true noise", yscale="log")
-    noise.legend()
+    noise.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     figure.savefig(path)
 
 

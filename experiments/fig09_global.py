@@ -83,8 +83,9 @@ def explore(
     """
     robot = Robot()
     poses = jnp.asarray(places, float)
-    less = {"range": jnp.asarray(RANGE, float), "bearing": jnp.asarray(BEARING, float)}
-    noise = slam.wheel_noise(robot)._replace(**less)
+    noise = slam.wheel_noise(robot)._replace(
+        range=jnp.asarray(RANGE, float), bearing=jnp.asarray(BEARING, float)
+    )
     scans = scans_from(poses, jnp.asarray(walls, float), jax.random.key(seed))
     told = jnp.asarray(odometry(places, robot, seed), float)
     seen, links = slam.local_maps(CONFIG, scans)

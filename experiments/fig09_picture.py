@@ -64,14 +64,11 @@ def draw_whole(axis, numbers: Numbers) -> None:
         axis.plot(
             *np.array(line).T, color=SKY, linewidth=5, alpha=0.6, label="branch of the full room"
         )
+    near, ring = numbers["near_m"], np.linspace(0, 2 * np.pi, 40)
+    label = f"{100 * near:.0f} cm around a junction of the full room"
     for junction in numbers["reference"]["junctions"]:
-        ring = np.linspace(0, 2 * np.pi, 40)
-        rim = np.array(junction["xy"])[:, None] + numbers["near_m"] * np.array(
-            [np.cos(ring), np.sin(ring)]
-        )
-        axis.plot(
-            *rim, color=BLACK, linewidth=1.1, label="10 cm around a junction of the full room"
-        )
+        rim = np.array(junction["xy"])[:, None] + near * np.array([np.cos(ring), np.sin(ring)])
+        axis.plot(*rim, color=BLACK, linewidth=1.1, label=label)
     draw_map(axis, numbers["maps"][-1], 1.8, 6)
     way = np.array(numbers["places"])[:, :2].T
     axis.plot(*way, color=BLUE, linewidth=0.7, linestyle=":", label="way between the places")

@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from experiments import common
-from jaxslam import lidar, monte_carlo, motion, plan, slam, topomap
+from jaxslam import lidar, monte_carlo, motion, plan, slam, topomap, ways
 from jaxslam.geometry import compose
 from jaxslam.metrics import pose_error
 from jaxslam.motion import Robot
@@ -65,11 +65,11 @@ def way_home(graph: topomap.Graph, trail: np.ndarray) -> np.ndarray:
     size = len(graph.xy)
     joined = coo_matrix((np.ones(len(graph.pairs)), graph.pairs.T), shape=(size, size))
     part = connected_components(joined, directed=False)[1]
-    nodes = np.flatnonzero(part == np.argmax(np.bincount(part)))
-    away = np.linalg.norm(trail[:, None] - graph.xy[nodes], axis=2)
-    met = np.flatnonzero(np.any(away < graph.clearance[nodes], axis=1))  # nothing is in a circle
-    node = lambda t: nodes[np.argmin(np.where(away[t] < graph.clearance[nodes], away[t], np.inf))]
-    way = plan.route(graph, node(met[-1]), node(met[0]))
+    largest = part == np.argmax(np.bincount(part))
+    circles = np.where(largest, graph.clearance, 0.0)  # nothing is in a circle
+    at = np.array([ways.node_at(place, graph.xy, circles) for place in trail])
+    met = np.flatnonzero(at >= 0)
+    way = plan.route(graph, at[met[-1]], at[met[0]])
     return np.concatenate([trail[: met[-1] - 1 : -1], way.line, trail[met[0] :: -1]])
 
 

@@ -15,6 +15,7 @@ from jax import lax
 
 from jaxslam import ekf, sensor
 from jaxslam.belief import Belief, initial, know
+from jaxslam.conditioning import log_likelihood
 from jaxslam.nodes import from_polar
 from jaxslam.slam import map_batches
 from jaxslam.types import Array
@@ -186,8 +187,8 @@ def step(
         new, at = (who >= 0) & ~known, jnp.where(who >= 0, who, size)
         belief, _ = ekf.augment(belief, features, r, new, most=who.size, at=at, **how)
     dof = 2 * jnp.sum(known, dtype=jnp.int32)
-    density = done.nis + done.logdet + dof.astype(r.dtype) * jnp.log(2 * jnp.pi).astype(r.dtype)
-    return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, -0.5 * density, done.good)
+    likely = log_likelihood(done, dof)
+    return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, likely, done.good)
 
 
 def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:

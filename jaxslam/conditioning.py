@@ -89,6 +89,12 @@ def innovation_cov(cov: Blocks, rows: Rows) -> Array:
     return _seen(cov, rows)[2]
 
 
+def log_likelihood(done: Conditioned, dof: Array) -> Array:
+    """Log-likelihood () [nats] of the residuals, of which `dof` () int32 numbers count."""
+    numbers = dof.astype(done.nis.dtype)
+    return -0.5 * (done.nis + done.logdet + numbers * jnp.log(2 * jnp.pi).astype(done.nis.dtype))
+
+
 def plus(cov: Blocks, left: tuple[Array, Array], right: tuple[Array, Array], *, sign=1) -> Blocks:
     """Add the products of rows, of pose (k, 3) and map (k, 2 L) each: cov + sign left^T right."""
     return Blocks(

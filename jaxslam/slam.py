@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxslam import edges, ekf, junctions, links, nodes, topomap, voronoi
 from jaxslam.belief import Belief, forget, initial, note, worth
-from jaxslam.conditioning import drop, innovation_cov
+from jaxslam.conditioning import drop, innovation_cov, log_likelihood
 from jaxslam.edges import RunSpec
 from jaxslam.grid import GridSpec, rasterise, seen_free
 from jaxslam.lidar import Lidar, Scan
@@ -231,7 +231,6 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
         doubted = used & jnp.zeros_like(used).at[order].set(~believed)
         used, slot = used & ~doubted, jnp.where(doubted, size, slot)
     after, done = ekf.update(before, rows, **how)
-    nis, logdet = done.nis, done.logdet
     finite = jnp.all(jnp.isfinite(after.mean)) & done.good
     # A conditioning that fails changes no covariance.
     after = after._replace(mean=jnp.where(finite, after.mean, before.mean))
@@ -258,16 +257,15 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     slot = jnp.minimum(slot, fresh)
     rank = jnp.where(seen.kind == WALL, 1, 2)
     dof = jnp.sum(jnp.where(used, rank, 0), dtype=jnp.int32)
-    density = nis + logdet + dof.astype(nis.dtype) * jnp.log(2 * jnp.pi).astype(nis.dtype)
     info = Info(
         pose=after.pose,
         pose_cov=after.pose_cov,
         slot=slot,
         id=after.id.at[slot].get(mode="fill", fill_value=-1),
         used=used,
-        nis=jnp.where(finite, nis, 0.0),
+        nis=jnp.where(finite, done.nis, 0.0),
         dof=dof,
-        log_likelihood=jnp.where(finite, -0.5 * density, 0.0),
+        log_likelihood=jnp.where(finite, log_likelihood(done, dof), 0.0),
         finite=finite,
         fresh=jnp.sum(fresh < size, dtype=jnp.int32),
         forgotten=forgotten,

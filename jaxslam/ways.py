@@ -154,10 +154,23 @@ def along(lines: Sequence[np.ndarray], pairs: np.ndarray, arcs: Sequence[int], s
     return nodes, np.concatenate(parts) if parts else np.zeros((0, 2))
 
 
+def node_at(place: np.ndarray, xy: np.ndarray, clearance: np.ndarray) -> int:
+    """Node in whose circle a place (2,) is, the nearest where circles overlap; -1 for none.
+
+    Args:
+        place: [m].
+        xy: (N, 2) [m] positions of the nodes.
+        clearance: (N,) [m] radii of their circles.
+    """
+    away = np.linalg.norm(xy - place, axis=1)
+    inside = np.where(away < clearance, away, np.inf)
+    return int(np.argmin(inside)) if np.isfinite(inside).any() else -1
+
+
 def trail(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> list[Way]:
     """Drives of the robot from node to node, and from a node around back to it.
 
-    The robot is at a node while it is inside its circle, at the nearest where circles overlap.
+    The robot is at a node while it is inside its circle (`node_at`).
 
     Args:
         xy: (N, 2) [m] positions of the nodes.
@@ -167,9 +180,7 @@ def trail(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> list[Way]
     place = np.asarray(poses, float)[:, :2]
     found, here, since = [], -1, 0
     for step, at in enumerate(place):
-        away = np.linalg.norm(xy - at, axis=1)
-        inside = np.where(away < clearance, away, np.inf)
-        now = int(np.argmin(inside)) if np.isfinite(inside).any() else -1
+        now = node_at(at, xy, clearance)
         if now >= 0 and here >= 0 and (now != here or step > since + 1):
             line = np.concatenate([xy[[here]], place[since : step + 1], xy[[now]]])
             found.append(Way(here, now, evenly(line), float(size(line)), np.nan, 1))

@@ -42,13 +42,13 @@ def nine():
     return experiment(9, threads=2)
 
 
-def equal(one, two):
+def assert_same(one, two):
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
 def test_runs_do_not_depend_on_their_number_nor_on_threads(nine):
     many, few = monte_carlo.collect(nine), monte_carlo.collect(experiment(6, threads=1))
-    equal(jax.tree.map(lambda x: x[:6], many), few)
+    assert_same(jax.tree.map(lambda x: x[:6], many), few)
     assert len(np.unique(many.truth[:, -1, 0])) == 9
 
 
@@ -74,7 +74,7 @@ def test_the_filter_finds_and_uses_landmarks(nine):
 def test_map_batches_equals_vmap(count, size):
     items = {"a": jnp.arange(3.0 * count).reshape(count, 3), "b": jnp.arange(count)}
     function = lambda item: (item["a"].sum() * item["b"].astype(float), item["b"] + 1)
-    equal(monte_carlo.map_batches(function, items, size=size), jax.vmap(function)(items))
+    assert_same(monte_carlo.map_batches(function, items, size=size), jax.vmap(function)(items))
 
 
 def driven(keys, steps):

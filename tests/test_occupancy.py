@@ -40,7 +40,7 @@ def write(tmp_path):
     return make
 
 
-def check(map, occupied=OCCUPIED, free=FREE):
+def assert_cells(map, occupied=OCCUPIED, free=FREE):
     np.testing.assert_array_equal(map.occupied, turned(occupied))
     np.testing.assert_array_equal(map.free, turned(free))
 
@@ -48,7 +48,7 @@ def check(map, occupied=OCCUPIED, free=FREE):
 @pytest.mark.parametrize("name", ["map.pgm", "map.png", "map.bmp"])
 def test_shades_become_cells_with_x_first(write, name):
     map = occupancy.read(write(name=name))
-    check(map)
+    assert_cells(map)
     assert map.resolution == 0.05
     np.testing.assert_array_equal(map.origin, [-1.5, 2.0, 0.25])
 
@@ -65,36 +65,36 @@ def test_shades_become_cells_with_x_first(write, name):
 def test_every_kind_of_pgm_is_read(write, tmp_path, content):
     path = write()
     (tmp_path / "map.pgm").write_bytes(content)
-    check(occupancy.read(path))
+    assert_cells(occupancy.read(path))
 
 
 def test_a_small_maxval_is_the_brightest_shade(write, tmp_path):
     path = write()
     (tmp_path / "map.pgm").write_bytes(b"P2 3 2 100\n0 34 36\n80 81 100\n")
-    check(occupancy.read(path))
+    assert_cells(occupancy.read(path))
 
 
 def test_negate_turns_dark_and_bright(write):
-    check(occupancy.read(write(255 - SHADES, negate=1)))
-    check(occupancy.read(write(255 - SHADES, negate="true")))
+    assert_cells(occupancy.read(write(255 - SHADES, negate=1)))
+    assert_cells(occupancy.read(write(255 - SHADES, negate="true")))
 
 
 def test_colours_are_averaged_and_transparent_pixels_unknown(write):
     image = np.stack([SHADES] * 3 + [np.full_like(SHADES, 255)], axis=-1)
-    check(occupancy.read(write(image, "map.png")))
+    assert_cells(occupancy.read(write(image, "map.png")))
     image[0, 0, 3] = image[1, 2, 3] = 0
     occupied, free = OCCUPIED.copy(), FREE.copy()
     occupied[0, 0] = free[1, 2] = False
-    check(occupancy.read(write(image, "map.png")), occupied, free)
+    assert_cells(occupancy.read(write(image, "map.png")), occupied, free)
 
 
 def test_raw_shades_are_percent_and_above_100_unknown(write):
     raw = np.array([[66, 100, 65], [255, 19, 0]], np.uint8)
-    check(occupancy.read(write(raw, mode="raw")))
+    assert_cells(occupancy.read(write(raw, mode="raw")))
 
 
 def test_scale_differs_in_nothing_that_counts(write):
-    check(occupancy.read(write(mode="scale")))
+    assert_cells(occupancy.read(write(mode="scale")))
 
 
 def test_numbers_that_yaml_takes_for_text_are_numbers(write):
@@ -103,7 +103,7 @@ def test_numbers_that_yaml_takes_for_text_are_numbers(write):
 
 def test_an_image_in_a_folder_below_is_found(write, tmp_path):
     (tmp_path / "images").mkdir()
-    check(occupancy.read(write(name="images/map.pgm")))
+    assert_cells(occupancy.read(write(name="images/map.pgm")))
 
 
 @pytest.mark.parametrize("field", list(FIELDS))

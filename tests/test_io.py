@@ -321,3 +321,30 @@ def test_geojson_refuses_what_is_no_graph(tmp_path, nodes, arcs, told):
 def test_geojson_of_an_empty_map(tmp_path):
     geojson.write(tmp_path / "map.geojson", [], [])
     assert json.loads((tmp_path / "map.geojson").read_text())["features"] == []
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_long_table_is_read_as_a_short_one(tmp_path, end):
+    content = ["# a b", "1 2.5", "", "  # 3 4", " -1e-3\t1248444187.156 ", "\t7 0"]
+    path = save(tmp_path / "a.dat", "\ufeff" + end.join(content))
+    numbers, values = text.table(path, ("a", "b"), "pairs")
+    slow = text.rows(path, ("a", "b"), "pairs")
+    assert list(zip(numbers.tolist(), values.tolist(), strict=True)) == slow and len(slow) == 3
+
+
+BROKEN_TABLES = [
+    "1 2\n3\n",
+    "1 2\n3 4 # x\n",
+    "1 2\nx 4\n",
+    "nan 1\n",
+    "1 inf\n",
+    "1\n2\n",
+    "# x\n",
+]
+
+
+@pytest.mark.parametrize("content", [*BROKEN_TABLES, "", "1 \u00e4\n", "1 2\r3 4\n"])
+def test_a_long_table_is_refused_as_a_short_one(tmp_path, content):
+    path = save(tmp_path / "a.dat", content)
+    said = [complaint(read, path, ("a", "b"), "pairs") for read in (text.rows, text.table)]
+    assert said[0] == said[1]

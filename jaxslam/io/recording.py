@@ -1,4 +1,4 @@
-"""What every reader of recorded logs returns."""
+"""What the readers of recorded logs return."""
 
 from typing import NamedTuple
 
@@ -20,3 +20,23 @@ class Recording(NamedTuple):
     skipped: int  # broken lines left out
     wheel_times: np.ndarray  # (N,) float64 [s] of the whole stream of wheel poses
     wheel_poses: np.ndarray  # (N, 3) float64 [m, m, rad]; the scans' own if there is no stream
+
+
+class Sightings(NamedTuple):
+    """A recorded drive of a robot whose sensor tells range, bearing and name of landmarks.
+
+    T steps in order of time, with up to M of the L landmarks each, or none. Motions are in the
+    frame of the step before. Left out are measurements of unknown names, and a second one of a
+    landmark at the same time.
+    """
+
+    times: np.ndarray  # (T,) float64 [s]
+    motion: np.ndarray  # (T, 3) float64 [m, m, rad] by odometry since the step before; first: 0
+    polar: np.ndarray  # (T, M, 2) float32 range [m] and bearing [rad]; zero for padding
+    valid: np.ndarray  # (T, M) bool, False marks padding, which comes last
+    which: np.ndarray  # (T, M) int32 number 0..L-1 of the landmark; -1 for padding
+    truth: np.ndarray  # (T, 3) float64 [m, m, rad] reference pose, world frame; zero where none
+    referenced: np.ndarray  # (T,) bool, where there is one
+    places: np.ndarray  # (L, 2) float64 [m] reference positions of the landmarks, world frame
+    names: np.ndarray  # (L,) int32 what the recording calls them
+    skipped: int  # measurements left out

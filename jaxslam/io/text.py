@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
+
 from jaxslam.io.errors import InputError
 
 
@@ -95,3 +97,29 @@ def rows(path: str | PathLike, names: Sequence[str], form: str) -> list[tuple[in
     if not table:
         raise InputError("holds only comments", path=path, advice=f"name a file of {form}")
     return table
+
+
+def table(path: str | PathLike, names: Sequence[str], form: str) -> tuple[np.ndarray, np.ndarray]:
+    """Read a long table as `rows` does, in a fraction of the time.
+
+    Args:
+        path: Text file; `#` starts a comment line.
+        names: What the K fields are called, in order.
+        form: What such a file is called, for the errors.
+
+    Returns:
+        Line numbers (N,) and values (N, K).
+
+    Raises:
+        InputError: As `rows`.
+    """
+    kept = [(line, text) for line, text in lines(path) if not text.lstrip().startswith(b"#")]
+    kept = [(line, text) for line, text in kept if text.strip()]
+    try:
+        values = np.loadtxt([text for _, text in kept], comments=None, ndmin=2) if kept else None
+    except ValueError:
+        values = None
+    if values is None or values.shape[1] != len(names) or not np.isfinite(values).all():
+        kept = rows(path, names, form)  # says where it is broken
+        values = np.array([row for _, row in kept])
+    return np.array([line for line, _ in kept]), values

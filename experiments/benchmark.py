@@ -18,9 +18,9 @@ from jax.experimental.compilation_cache import compilation_cache
 from experiments import common, estimator, filters, peers
 from experiments.one_core import least, pin, seconds
 from jaxslam import edges, junctions, monte_carlo, nodes, slam, voronoi
+from jaxslam.batches import map_batches
 from jaxslam.grid import seen_free
 from jaxslam.lidar import Scan, cast
-from jaxslam.slam import map_batches
 
 LOOKED_AT = 512  # scans at most that the front end is timed on
 

@@ -29,10 +29,10 @@ from experiments.common import Numbers, scene
 from experiments.one_core import least, pin, seconds, unpin
 from experiments.workload import TOGETHER, Drive, Steps
 from jaxslam import monte_carlo, slam
+from jaxslam.batches import map_batches
 from jaxslam.lidar import cast
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
-from jaxslam.slam import map_batches
 from jaxslam.types import Array
 
 YARDSTICK = peers.YARDSTICK.with_name("ekf_limit.c")

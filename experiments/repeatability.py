@@ -33,6 +33,7 @@ from experiments.viewpoints import (
     visible_circles,
 )
 from jaxslam import lidar, slam, world
+from jaxslam.batches import map_batches
 from jaxslam.io import occupancy
 from jaxslam.io.errors import InputError
 from jaxslam.lidar import Scan
@@ -74,7 +75,7 @@ USUAL, COARSE = Case("runs", 0.01), Case("runs", 0.01, skip=2)
 
 @partial(jax.jit, static_argnames="config")
 def _features(config: slam.Config, scans: Scan) -> Nodes:
-    return slam.map_batches(partial(slam.front_end, config), scans, size=slam.BATCH)
+    return map_batches(partial(slam.front_end, config), scans, size=slam.BATCH)
 
 
 def look(key, worlds: Worlds, case: Case) -> Seen:

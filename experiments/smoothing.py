@@ -13,8 +13,8 @@ import numpy as np
 
 from experiments import common, estimator, workload
 from jaxslam import smoother
+from jaxslam.batches import map_batches
 from jaxslam.metrics import pose_error
-from jaxslam.slam import map_batches
 from jaxslam.types import CORNER, Array
 
 ITERATIONS = 10

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from jaxslam import grid, slam
+from jaxslam.batches import map_batches
 from jaxslam.lidar import Scan, points
 from jaxslam.nodes import Nodes
 from jaxslam.types import NODE
@@ -35,7 +36,7 @@ def _seen(config: slam.Config, scans: Scan):
         points(scan, config.lidar),
         grid.seen_free(scan, config.lidar, config.grid),
     )
-    return slam.map_batches(one, scans, size=slam.BATCH)
+    return map_batches(one, scans, size=slam.BATCH)
 
 
 def walls(ends: np.ndarray, hit: np.ndarray, spec: grid.GridSpec) -> np.ndarray:

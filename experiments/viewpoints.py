@@ -10,6 +10,7 @@ from scipy.spatial import Delaunay
 
 from experiments import truth
 from jaxslam import lidar, medial, slam
+from jaxslam.batches import map_batches
 from jaxslam.lidar import Lidar
 from jaxslam.types import CORNER, NODE
 from jaxslam.world import PLAN_WALLS, World
@@ -54,7 +55,7 @@ class Drawn:
 @partial(jax.jit, static_argnames="scanner")
 def _cast(walls, poses, scanner: Lidar):
     one = lambda pose: lidar.cast(World(walls), pose, scanner).ranges
-    return slam.map_batches(one, poses, size=slam.BATCH)
+    return map_batches(one, poses, size=slam.BATCH)
 
 
 class Cells:

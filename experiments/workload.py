@@ -14,10 +14,10 @@ import numpy as np
 from jax import lax
 
 from jaxslam import ekf, sensor
+from jaxslam.batches import map_batches
 from jaxslam.belief import Belief, initial, know
 from jaxslam.conditioning import log_likelihood
 from jaxslam.nodes import from_polar
-from jaxslam.slam import map_batches
 from jaxslam.types import Array
 
 TOGETHER = 8  # runs filtered together: of 4, 8, 16, 32 the best for the gradient

@@ -16,7 +16,7 @@ from jaxslam.association import claim_slots
 from jaxslam.belief import Belief, forget
 from jaxslam.conditioning import Blocks, Conditioned, Rows, condition, plus
 from jaxslam.geometry import compose, rotation, to_world, wrap_angle, wrap_line
-from jaxslam.linalg import inverse_root
+from jaxslam.linalg import add_products, inverse_root, lower, put_rows
 from jaxslam.nodes import Nodes
 from jaxslam.sensor import expect, observation, residual
 from jaxslam.types import WALL, Array
@@ -165,11 +165,12 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     root = jnp.where(found & good, root, 0.0)
     y = root @ hp, root @ hm
     w = -root @ difference(belief.places[pair])
-    belief = _with(
-        belief,
-        belief.mean + jnp.concatenate([w @ y[0], w @ y[1]]),
-        plus(blocks(belief), y, y, sign=-1),
+    cov = Blocks(
+        pose=add_products(belief.pose_cov, y[0], y[0], sign=-1),
+        cross=add_products(belief.cross_cov, y[0], y[1], sign=-1),
+        map=lower(belief.map_cov, y[1], found),
     )
+    belief = _with(belief, belief.mean + jnp.concatenate([w @ y[0], w @ y[1]]), cov)
     gone = found & good & (jnp.arange(size, dtype=jnp.int32) == drop)
     more = jnp.where(found & good, belief.seen.at[drop].get(mode="fill", fill_value=0), 0)
     belief = belief._replace(seen=belief.seen.at[keep].add(more))
@@ -272,8 +273,9 @@ def augment(
     own = jnp.einsum("mij,mjk,mlk->mil", by_seen, noise[order], by_seen)
     among = among.at[index, :, index].add(own)  # (F, 2, F, 2)
     row = jnp.stack([2 * slot, jnp.minimum(2 * slot + 1, 2 * size)], axis=-1).reshape(-1)
-    rows = rows.reshape(2 * most, -1).at[:, row].set(among.reshape(2 * most, -1), mode="drop")
-    map_cov = belief.map_cov.at[row].set(rows, mode="drop").at[:, row].set(rows.T, mode="drop")
+    alone = {"mode": "drop", "unique_indices": True}
+    rows = rows.reshape(2 * most, -1).at[:, row].set(among.reshape(2 * most, -1), **alone)
+    map_cov = put_rows(belief.map_cov, rows, row)
     place = jnp.where(is_wall, wall, place).reshape(-1)
     in_mean = jnp.where(row < 2 * size, 3 + row, belief.mean.size)
 
@@ -283,9 +285,9 @@ def augment(
     taken = slot < size
     number = belief.next_id + jnp.cumsum(taken, dtype=jnp.int32) - 1 if at is None else slot
     belief = belief._replace(
-        mean=belief.mean.at[in_mean].set(place, mode="drop"),
-        anchor=belief.anchor.at[in_mean].set(place, mode="drop"),
-        cross_cov=belief.cross_cov.at[:, row].set(cross.T, mode="drop"),
+        mean=belief.mean.at[in_mean].set(place, **alone),
+        anchor=belief.anchor.at[in_mean].set(place, **alone),
+        cross_cov=belief.cross_cov.at[:, row].set(cross.T, **alone),
         map_cov=map_cov,
         seen=put(belief.seen, jnp.ones_like(slot)),
         last=put(belief.last, jnp.broadcast_to(belief.step, slot.shape)),

@@ -15,9 +15,10 @@ import numpy as np
 import optax
 
 from jaxslam import slam
+from jaxslam.batches import map_batches
 from jaxslam.metrics import pose_error
 from jaxslam.monte_carlo import Log
-from jaxslam.slam import Config, Inputs, Noise, map_batches
+from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array
 
 GROUP = 4  # runs that are differentiated together; bounds memory

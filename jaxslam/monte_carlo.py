@@ -15,12 +15,13 @@ import numpy as np
 from jax import lax
 
 from jaxslam import lidar, motion, plan, slam
+from jaxslam.batches import map_batches
 from jaxslam.geometry import compose
 from jaxslam.lidar import Scan
 from jaxslam.metrics import nees, pose_error
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
-from jaxslam.slam import Config, Inputs, Noise, Survey, map_batches
+from jaxslam.slam import Config, Inputs, Noise, Survey
 from jaxslam.types import Array, Key
 from jaxslam.world import World
 

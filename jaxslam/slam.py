@@ -3,9 +3,8 @@
 `step` is the only place where front end and filter meet, and `run` the only loop over time.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ import numpy as np
 from jax import lax
 
 from jaxslam import edges, ekf, junctions, links, nodes, topomap, voronoi
+from jaxslam.batches import map_batches
 from jaxslam.belief import Belief, forget, initial, note, worth
 from jaxslam.conditioning import drop, innovation_cov, log_likelihood
 from jaxslam.edges import RunSpec
@@ -28,24 +28,6 @@ from jaxslam.recognition import MatchSpec, identify, overdue, recognise, second_
 from jaxslam.types import CORNER, NODE, WALL, Array
 
 BATCH = 16  # scans that are looked at together
-
-
-def map_batches(function: Callable, items: Any, *, size: int) -> Any:
-    """Map `function` over the leading axis of `items`, `size` of them vectorised at a time.
-
-    The last batch is filled up with the last item: unlike `lax.map(batch_size=...)` this compiles
-    the function once.
-    """
-    count = jax.tree.leaves(items)[0].shape[0]
-    size = min(size, count)
-    pad = -count % size
-
-    def fold(x: Array) -> Array:
-        x = jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x
-        return x.reshape((-1, size) + x.shape[1:])
-
-    result = lax.map(jax.vmap(function), jax.tree.map(fold, items))
-    return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:])[:count], result)
 
 
 class Config(NamedTuple):

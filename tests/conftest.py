@@ -7,6 +7,7 @@ import pytest
 # Most of the time of these tests is XLA's compiler, and what they run is small. The old emitters
 # take half of its time; they may go with a next version, and an unknown flag ends the process.
 FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+FLAGS += " --xla_force_host_platform_device_count=2"
 OLD = " --xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
 os.environ.setdefault("XLA_FLAGS", FLAGS + OLD)
 

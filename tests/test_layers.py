@@ -7,7 +7,7 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 ORDER = (
-    "types linalg geometry world motion lidar grid voronoi tiles lines edges global_edges "
+    "types linalg batches geometry world motion lidar grid voronoi tiles lines edges global_edges "
     "circles nodes sensor noise junctions links alignment association belief conditioning ekf "
     "recognition arrow ways topomap medial skeleton slam smoother plan metrics monte_carlo fit io "
     "plot report cli"

@@ -70,13 +70,6 @@ def test_the_filter_finds_and_uses_landmarks(nine):
     assert summary["position_rmse_m"] < 0.03
 
 
-@pytest.mark.parametrize("count, size", [(7, 3), (6, 3), (2, 5), (1, 1)])
-def test_map_batches_equals_vmap(count, size):
-    items = {"a": jnp.arange(3.0 * count).reshape(count, 3), "b": jnp.arange(count)}
-    function = lambda item: (item["a"].sum() * item["b"].astype(float), item["b"] + 1)
-    assert_same(monte_carlo.map_batches(function, items, size=size), jax.vmap(function)(items))
-
-
 def driven(keys, steps):
     many = jax.vmap(lambda key: monte_carlo.drive(key, ROBOT, jnp.asarray(PATH), steps=steps))
     return jax.tree.map(np.asarray, jax.jit(many)(keys))

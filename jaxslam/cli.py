@@ -1,6 +1,5 @@
-"""The command line: `jaxslam simulate`, `jaxslam run LOG` and `jaxslam map MAP.yaml`."""
+"""The command line: `jaxslam simulate`, `run LOG`, `map MAP.yaml` and `tune [LOG ...]`."""
 
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -18,13 +17,14 @@ import jaxslam
 from jaxslam import lidar, metrics, monte_carlo, plan, report, skeleton, slam
 from jaxslam import world as worlds
 from jaxslam.io import carmen, graphml, occupancy, tum
-from jaxslam.io import noise as noise_file
 from jaxslam.io import relations as relations_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
-from jaxslam.slam import Config, Noise
+from jaxslam.options import keep_compiled, named, noise_of, within
+from jaxslam.slam import Config
+from jaxslam.tuning import tune
 from jaxslam.types import NODE
 from jaxslam.world import World
 
@@ -41,14 +41,14 @@ def main(argv: list[str] | None = None) -> int:
     if argv[0] == "--version":
         print(f"jaxslam {jaxslam.__version__}")
         return 0
-    commands = {"simulate": simulate, "run": run, "map": map_grid}
+    commands = {"simulate": simulate, "run": run, "map": map_grid, "tune": tune}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
     except InputError as error:
         print(f"jaxslam: error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("jaxslam: interrupted, nothing written", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"jaxslam: {stop or 'interrupted, nothing written'}", file=sys.stderr)
         return 130
     return 0
 
@@ -76,17 +76,17 @@ def simulate(
         labels: What tells wall cells apart: straight runs, or the paper's edge codes.
         out: Folder for the results.
     """
-    _within("--runs", runs, 1, 10**6)
-    _within("--seed", seed, 0, 2**32 - 1)
-    with _named("--world"):
+    within("--runs", runs, 1, 10**6)
+    within("--seed", seed, 0, 2**32 - 1)
+    with named("--world"):
         known = World(jnp.asarray(worlds.named(world).walls, float))
         path = jnp.asarray(plan.densify(worlds.drive(world)), float)
     config = Config(labels=labels)
     config = config._replace(kinds=(NODE,)) if landmarks == "nodes" else config
-    assumed = _noise(noise, slam.wheel_noise(Robot()))
+    assumed = noise_of(noise, slam.wheel_noise(Robot()))
     given = (jax.random.key(seed), config, assumed, known, Robot(), path)
     with folder(out) as place:
-        _keep_compiled()
+        keep_compiled()
         steps = monte_carlo.drive_steps(Robot(), path)
         with _stopwatch() as seconds:
             tracks = _watch(monte_carlo.experiment(*given, runs=runs, steps=steps), runs)
@@ -133,17 +133,17 @@ def run(
     recording = carmen.read(log)
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
-    assumed = _noise(noise, slam.log_noise())
+    assumed = noise_of(noise, slam.log_noise())
     config = Config(lidar=recording.lidar, landmarks=LANDMARKS, confirm=CONFIRM)
     wheels = metrics.seen_from(recording.odometry[0], recording.odometry)
-    with _named(f"{reference or ''}"):
+    with named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)
-    with _named(f"{relations or ''}"):
+    with named(f"{relations or ''}"):
         blind |= {} if verified is None else report.against_relations(recording, wheels, verified)
     motions = np.concatenate([np.zeros((1, 3)), metrics.seen_from(wheels[:-1], wheels[1:])])
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
     with folder(out) as place:
-        _keep_compiled()
+        keep_compiled()
         print(f"{log}: {len(wheels)} scans of {config.lidar.beams} beams", flush=True)
         with _stopwatch() as seconds:
             moved = jnp.asarray(motions, float)
@@ -187,8 +187,8 @@ def map_grid(
         regions: Where the robot can be: the largest region, or all in which its centre has 1 m^2.
         out: Folder for the results.
     """
-    _within("--clearance", clearance, 0.01, 100.0)
-    _within("--speck", speck, 0.0, 100.0)
+    within("--clearance", clearance, 0.01, 100.0)
+    within("--speck", speck, 0.0, 100.0)
     graphml.require()
     grid = occupancy.read(map)
     size = "{} x {} cells of {:g} m".format(*grid.free.shape, grid.resolution)
@@ -205,7 +205,7 @@ def map_grid(
             bar.update(stages.index(stage) - bar.n)
 
         begin = perf_counter()
-        with _named(str(map)):
+        with named(str(map)):
             survey = skeleton.survey(
                 **grid._asdict(), clearance=clearance, speck=speck, area=area, watch=watch
             )
@@ -218,41 +218,6 @@ def map_grid(
         report.draw_map(place / "map.png", grid, survey.graph)
         bar.update()
     report.tell_map(numbers, f"{map}: clearance {clearance:g} m, regions {survey.regions}", out)
-
-
-def _within(option: str, value: float, low: float, high: float) -> None:
-    """Raise unless the value of an option is in its range."""
-    if not low <= value <= high:
-        raise InputError(f"{value} is not between {low} and {high}", field=option)
-
-
-@contextmanager
-def _named(what: str) -> Iterator[None]:
-    """Turn a ValueError of the block into an InputError that names the option or file."""
-    try:
-        yield
-    except ValueError as error:
-        raise InputError(str(error), field=what) from None
-
-
-def _noise(path: Path | None, default: Noise) -> Noise:
-    """Noise in a file; the default without one."""
-    return default if path is None else noise_file.read(path, default)
-
-
-def _keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told of another one."""
-    if jax.config.jax_compilation_cache_dir is not None:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    cache = Path(home) / "jaxslam"
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if os.access(cache, os.W_OK | os.X_OK):
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 @contextmanager

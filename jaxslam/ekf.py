@@ -236,7 +236,7 @@ def augment(
         ValueError: The linearisation is none of them; while tracing.
     """
     check_linearisation(linearisation)
-    size = belief.seen.size
+    size, most = belief.seen.size, min(most, wanted.size)
     # Put the wanted features first, so that a few rows suffice.
     order = jnp.argsort(~wanted, stable=True)[:most]
     if at is None:

@@ -1,11 +1,13 @@
-"""Noise that is tuned, not guessed: gradient descent on the localisation error of runs.
+"""Noise that is tuned, not guessed: gradient descent on what the filter gets wrong.
 
 Front end and data come first, the noise after: features are computed once, and only the filter is
-run again and differentiated. Matches are integers, so the gradient is that of the filter with its
-matches held fixed; they are found anew at every evaluation.
+run again and differentiated. All of `Noise` is smooth and tuned, as logarithms. Matches are not:
+they are integers, found anew at every evaluation, and the gradient is that of the filter with its
+matches held fixed. So what decides on matches alone, above all the probability of the association
+gate (`MatchSpec.gate`), has no gradient, and is not tuned here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,28 +15,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.flatten_util import ravel_pytree
 
 from jaxslam import slam
-from jaxslam.batches import map_batches
-from jaxslam.metrics import pose_error
+from jaxslam.batches import Spread
+from jaxslam.losses import Loss, localisation, needs_truth
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array
 
-GROUP = 4  # runs that are differentiated together; bounds memory
-HEADING = 1.0  # [m^2 / rad^2] what a squared heading error weighs beside a squared position error
+GROUP = 4  # runs that a device differentiates together; bounds memory
+
+
+class State(NamedTuple):
+    """Where a tuning stands: all that it needs to go on. P parameters, N steps in all."""
+
+    step: np.ndarray  # () int64, evaluated so far
+    theta: np.ndarray  # (P,) float64, logarithms of the noise to be evaluated next
+    optimiser: Any  # state of the optimiser, of the parameters that are free
+    thetas: np.ndarray  # (N + 1, P) float64, what each step evaluated
+    loss: np.ndarray  # (N + 1,) float64, mean over the runs of each step; NaN: not yet
+    heldout: np.ndarray  # (N + 1,) float64, over the held-out runs; NaN: not evaluated
+    skipped: np.ndarray  # (N + 1,) int64, runs left out because they gave no finite gradient
 
 
 class Fit(NamedTuple):
-    """Result of `tune`."""
+    """Result of `tune`. N evaluations: steps + 1, or fewer when it stopped early."""
 
-    noise: Noise  # the best seen on the training runs
-    loss: np.ndarray  # (steps + 1,) over the runs of each step
-    history: Noise  # [steps + 1] what each step evaluated
-    skipped: np.ndarray  # (steps + 1,) runs left out because they gave no finite gradient
-
-
-Loss = Callable[[Config, Noise, Log], Array]
+    noise: Noise  # the best
+    best: int  # and which evaluation that is
+    loss: np.ndarray  # (N,) mean over the runs of each step
+    heldout: np.ndarray  # (N,) mean over the held-out runs; NaN where not evaluated
+    history: Noise  # [N] what each step evaluated
+    skipped: np.ndarray  # (N,) runs left out because they gave no finite gradient
 
 
 def unconstrain(noise: Noise) -> Noise:
@@ -47,47 +60,111 @@ def constrain(theta: Noise) -> Noise:
     return jax.tree.map(jnp.exp, theta)
 
 
-def localisation(config: Config, noise: Noise, log: Log) -> Array:
-    """Mean squared position error [m^2] of one run, and its heading error weighed by `HEADING`."""
+def names(noise: Noise) -> tuple[str, ...]:
+    """Names of the P parameters: `range`, or `odometry[2]` of several."""
+    return tuple(
+        f"{field}[{i}]" if np.ndim(value) else field
+        for field, value in noise._asdict().items()
+        for i in range(np.size(value))
+    )
+
+
+def free(noise: Noise, frozen: Collection[str] = ()) -> np.ndarray:
+    """Which of the P parameters (P,) bool are tuned.
+
+    Args:
+        noise: The noise.
+        frozen: Names of parameters that stay, or of fields: `odometry` is all four.
+
+    Raises:
+        ValueError: There is no such parameter, or none is left.
+    """
+    known = names(noise)
+    unknown = set(frozen) - set(known) - set(noise._fields)
+    if unknown:
+        raise ValueError(
+            f"no parameter is called {sorted(unknown)[0]!r}; known: {', '.join(known)}"
+        )
+    rest = np.array([not {name, name.split("[")[0]} & set(frozen) for name in known])
+    if not rest.any():
+        raise ValueError("all parameters are frozen: nothing is left to tune")
+    return rest
+
+
+def scaled(noise: Noise, parameter: int, by: float) -> Noise:
+    """The noise with one of its P parameters times exp(by)."""
+    flat, unravel = ravel_pytree(noise)
+    return unravel(flat.at[parameter].multiply(jnp.exp(jnp.asarray(by, flat.dtype))))
+
+
+def _value(config: Config, loss: Loss, theta: Noise, log: Log) -> Array:
+    """Loss () of one run."""
     start = slam.init(config, log.truth[0])
-    _, info = slam.run(config, noise, start, Inputs(log.motion, log.nodes))
-    error = pose_error(info.pose, log.truth)
-    return jnp.mean(jnp.sum(error[:, :2] ** 2, axis=1) + HEADING * error[:, 2] ** 2)
+    _, info = slam.run(config, constrain(theta), start, Inputs(log.motion, log.nodes, log.known))
+    return loss(info, log)
 
 
-def likelihood(config: Config, noise: Noise, log: Log) -> Array:
-    """Mean negative log-likelihood [nats] a step of the innovations of one run; needs no truth."""
-    start = slam.init(config, log.truth[0])
-    _, info = slam.run(config, noise, start, Inputs(log.motion, log.nodes))
-    return -jnp.mean(info.log_likelihood)
+def _value_and_gradient(config: Config, loss: Loss, theta: Noise, log: Log) -> tuple[Array, Array]:
+    """Loss () of one run and its gradient (P,) in the logarithms of the noise."""
+    value, gradient = jax.value_and_grad(_value, argnums=2)(config, loss, theta, log)
+    return value, ravel_pytree(gradient)[0]
 
 
-@partial(jax.jit, static_argnames=("config", "loss"))
-def value_and_gradient(
-    theta: Noise, config: Config, logs: Log, loss: Loss
-) -> tuple[Array, Noise, Array]:
-    """Loss over runs and its gradient in the logarithms of the noise.
+_VALUES = Spread(_value, size=GROUP, static=2)
+_GRADIENTS = Spread(_value_and_gradient, size=GROUP, static=2)
 
-    Runs whose loss or gradient is not finite are left out.
+
+def values(noise: Noise, config: Config, logs: Log, loss: Loss = localisation) -> np.ndarray:
+    """Loss (B,) float64 of each run."""
+    return np.asarray(_VALUES(config, loss, unconstrain(noise), logs), np.float64)
+
+
+def gradients(
+    noise: Noise, config: Config, logs: Log, loss: Loss = localisation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Loss (B,) of each run and its gradient (B, P) in the logarithms of the noise, float64."""
+    both = _GRADIENTS(config, loss, unconstrain(noise), logs)
+    return tuple(np.asarray(x, np.float64) for x in both)
+
+
+def mean_gradient(values: np.ndarray, each: np.ndarray) -> tuple[float, np.ndarray, int]:
+    """Means of losses (B,) and gradients (B, P) over runs, those left out where one is not finite.
 
     Returns:
-        Mean loss (), its gradient, and the number () of runs left out.
+        Mean loss, NaN of no runs; mean gradient (P,), 0 of no runs; number of runs left out.
     """
+    good = np.isfinite(values) & np.isfinite(each).all(axis=1)
+    if not good.any():
+        return np.nan, np.zeros(each.shape[1]), len(good)
+    return values[good].mean(), each[good].mean(axis=0), int(np.sum(~good))
 
-    def one(log: Log) -> tuple[Array, Noise]:
-        return jax.value_and_grad(lambda t: loss(config, constrain(t), log))(theta)
 
-    values, gradients = map_batches(one, logs, size=GROUP)
-    good = jnp.isfinite(values)
-    for leaf in jax.tree.leaves(gradients):
-        good &= jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
-    count = jnp.maximum(jnp.sum(good), 1).astype(values.dtype)
+def check(config: Config, logs: Log, loss: Loss, *, what: str = "logs") -> None:
+    """Raise ValueError where a loss cannot be had of runs, before any work starts.
 
-    def mean(x: Array) -> Array:
-        keep = good.reshape((-1,) + (1,) * (x.ndim - 1))
-        return jnp.sum(jnp.where(keep, x, jnp.zeros_like(x)), axis=0) / count
+    Raises:
+        ValueError: There are no runs, or one has no truth and the loss needs it.
+    """
+    runs = logs.motion.shape[0]
+    if not runs:
+        raise ValueError(f"{what}: no runs to tune on")
+    if needs_truth(loss) and logs.judged is not None:
+        blind = np.flatnonzero(~np.asarray(logs.judged).any(axis=1))
+        if blind.size:
+            raise ValueError(
+                f"{what}: run {blind[0]} has no reference, which this loss needs; "
+                "give one, or use the likelihood"
+            )
 
-    return mean(values), jax.tree.map(mean, gradients), jnp.sum(~good)
+
+def draw(seed: int, step: int, runs: int, batch: int) -> np.ndarray:
+    """Runs (batch,) of a step: the next of a shuffled pack of all, and shuffled anew after it."""
+    place = step * batch + np.arange(batch)
+    pack = {
+        turn: np.random.default_rng([seed, turn]).permutation(runs)
+        for turn in set((place // runs).tolist())
+    }
+    return np.sort([pack[turn][at] for turn, at in zip(place // runs, place % runs, strict=True)])
 
 
 def tune(
@@ -95,12 +172,17 @@ def tune(
     config: Config,
     logs: Log,
     *,
+    loss: Loss = localisation,
     optimiser: optax.GradientTransformation | None = None,
     steps: int = 30,
-    loss: Loss = localisation,
     batch: int | None = None,
     seed: int = 0,
-    report: Callable[[int, float], Any] | None = None,
+    frozen: Collection[str] = (),
+    heldout: Log | None = None,
+    every: int = 1,
+    patience: int | None = None,
+    state: State | None = None,
+    report: Callable[[State], Any] | None = None,
 ) -> Fit:
     """Fit the noise to runs by gradient descent.
 
@@ -108,40 +190,155 @@ def tune(
         noise: Where to start.
         config: Of the filter.
         logs: [B] training runs.
-        optimiser: Adam with a step of 0.1, which decays to a tenth, unless given.
+        loss: Mean of this over runs is made small; one of `losses`, or any function of the info
+            of a filtered run and its log.
+        optimiser: Of the logarithms of the free parameters; Adam with a step of 0.1, which decays
+            to a tenth, unless given.
         steps: Number of updates.
-        loss: Mean of this over runs is made small; `localisation`, `likelihood`, or any function
-            of (config, noise, log).
-        batch: Runs a step, drawn at random; all of them unless given.
-        seed: Of that draw.
-        report: Called with the step and its loss, to show progress.
+        batch: Runs a step, in turn from a shuffled pack; all of them unless given.
+        seed: Of that shuffle.
+        frozen: Names of parameters, or fields of the noise, that stay as they are.
+        heldout: [H] runs to judge by, which nothing is tuned on.
+        every: Evaluations from one judgement to the next.
+        patience: Judgements without a better one after which it stops; never unless given.
+        state: Where an earlier call with the same arguments stood; the result is the same.
+        report: Called with the state after each evaluation: to show it, or to keep it.
 
     Returns:
-        The fit; its noise is the best evaluated (the last, when runs are drawn for each step).
+        The fit. Its noise is the best: on the held-out runs where there are any, else on all
+        training runs; or the last, where each step sees other runs and nothing compares them.
+
+    Raises:
+        ValueError: Runs are too few or lack the truth that the loss needs, a name is none of a
+            parameter, a number is out of range, or the noise is not positive.
     """
-    if optimiser is None:
-        optimiser = optax.adam(optax.cosine_decay_schedule(0.1, steps, alpha=0.1))
-    theta = unconstrain(noise)
-    state = optimiser.init(theta)
-    update = jax.jit(optimiser.update)
-    runs = logs.motion.shape[0]
-    draw = np.random.default_rng(seed)
-    values, thetas, skipped = [], [], []
-    for step in range(steps + 1):
-        some = logs
-        if batch is not None and batch < runs:
-            chosen = np.sort(draw.choice(runs, batch, replace=False))
-            some = jax.tree.map(lambda x: x[chosen], logs)  # noqa: B023
-        value, gradient, bad = value_and_gradient(theta, config, some, loss)
-        values.append(float(value))
-        thetas.append(theta)
-        skipped.append(int(bad))
-        if report is not None:
-            report(step, values[-1])
-        if step < steps:
-            change, state = update(gradient, state, theta)
-            theta = optax.apply_updates(theta, change)
+    check(config, logs, loss)
+    if heldout is not None:
+        check(config, heldout, loss, what="heldout")
+    for name, number in {"batch": batch, "every": every, "patience": patience}.items():
+        if number is not None and number < 1:
+            raise ValueError(f"{name} is {number}; it must be 1 or more")
+    noise = jax.tree.map(lambda x: jnp.asarray(x, float), noise)
+    start, unravel = ravel_pytree(noise)
+    moves, runs = free(noise, frozen), logs.motion.shape[0]
     whole = batch is None or batch >= runs
-    best = thetas[int(np.nanargmin(values))] if whole else thetas[-1]
-    history = jax.tree.map(lambda *x: jnp.stack(x), *map(constrain, thetas))
-    return Fit(constrain(best), np.array(values), history, np.array(skipped))
+    optimiser = _adam(steps) if optimiser is None else optimiser
+    if state is None:
+        state = begin(noise, steps=steps, frozen=frozen, optimiser=optimiser)
+    noise_of = lambda theta: constrain(unravel(jnp.asarray(theta, start.dtype)))
+
+    while state.step <= steps and not _stalled(state, patience):
+        now, step = noise_of(state.theta), int(state.step)
+        some = logs
+        if not whole:
+            some = jax.tree.map(partial(_take, draw(seed, step, runs, batch)), logs)
+        value, gradient, bad = mean_gradient(*gradients(now, config, some, loss))
+        judged = np.nan
+        if heldout is not None and (step % every == 0 or step == steps):
+            judged = _finite_mean(values(now, config, heldout, loss))
+        state = _note(state, value, judged, bad)
+        state = _move(state, optimiser, gradient, moves)
+        if report is not None:
+            report(state)
+    return result(state, noise, whole=whole)
+
+
+def begin(
+    noise: Noise,
+    *,
+    steps: int,
+    frozen: Collection[str] = (),
+    optimiser: optax.GradientTransformation | None = None,
+) -> State:
+    """The state before the first evaluation; the arguments are those of `tune`.
+
+    Raises:
+        ValueError: The noise is not positive, or a name is none of a parameter.
+    """
+    start = np.asarray(ravel_pytree(noise)[0], np.float64)
+    if not (np.isfinite(start) & (start > 0.0)).all():
+        raise ValueError(f"the noise to start from is not positive: {noise}")
+    theta, none = np.log(start), np.full(steps + 1, np.nan)
+    optimiser = _adam(steps) if optimiser is None else optimiser
+    return State(
+        step=np.int64(0),
+        theta=theta,
+        optimiser=optimiser.init(jnp.asarray(theta[free(noise, frozen)])),
+        thetas=np.full((steps + 1, theta.size), np.nan),
+        loss=none,
+        heldout=none,
+        skipped=np.zeros(steps + 1, np.int64),
+    )
+
+
+def _adam(steps: int) -> optax.GradientTransformation:
+    return optax.adam(optax.cosine_decay_schedule(0.1, max(steps, 1), alpha=0.1))
+
+
+def result(state: State, noise: Noise, *, whole: bool = True) -> Fit:
+    """What a state has found so far; `noise` is any with the same parameters.
+
+    Args:
+        state: After one evaluation at least.
+        noise: Any noise: for its fields.
+        whole: Whether each step saw all runs, so that their losses compare.
+    """
+    done = int(state.step)
+    like, unravel = ravel_pytree(noise)
+    thetas = jnp.asarray(state.thetas[:done], like.dtype)
+    best = _best(state, whole)
+    return Fit(
+        noise=constrain(unravel(thetas[best])),
+        best=best,
+        loss=state.loss[:done],
+        heldout=state.heldout[:done],
+        history=constrain(jax.vmap(unravel)(thetas)),
+        skipped=state.skipped[:done],
+    )
+
+
+def _note(state: State, value: float, judged: float, bad: int) -> State:
+    """Write an evaluation down."""
+    at = np.arange(len(state.loss)) == state.step
+    put = lambda old, new: np.where(at.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+    return state._replace(
+        step=state.step + 1,
+        thetas=put(state.thetas, state.theta[None]),
+        loss=put(state.loss, value),
+        heldout=put(state.heldout, judged),
+        skipped=put(state.skipped, bad),
+    )
+
+
+def _move(state: State, optimiser: Any, gradient: np.ndarray, moves: np.ndarray) -> State:
+    """Update the free parameters."""
+    theta = jnp.asarray(state.theta[moves])
+    slope = jnp.asarray(gradient[moves], theta.dtype)
+    with jax.numpy_dtype_promotion("standard"):  # optax asks for it
+        change, kept = optimiser.update(slope, state.optimiser, theta)
+    moved = state.theta.copy()
+    moved[moves] += np.asarray(change, np.float64)
+    return state._replace(theta=moved, optimiser=kept)
+
+
+def _take(chosen: np.ndarray, x: Array) -> Array:
+    return x[chosen]
+
+
+def _finite_mean(values: np.ndarray) -> float:
+    good = np.isfinite(values)
+    return values[good].mean() if good.any() else np.nan
+
+
+def _best(state: State, whole: bool) -> int:
+    """Number of the best evaluation."""
+    for losses in (state.heldout, state.loss) if whole else (state.heldout,):
+        if np.isfinite(losses).any():
+            return int(np.nanargmin(losses))
+    return int(state.step) - 1
+
+
+def _stalled(state: State, patience: int | None) -> bool:
+    """Whether the last judgements, as many as the patience, all were worse than one before."""
+    judged = state.heldout[np.isfinite(state.heldout)]
+    return patience is not None and len(judged) - 1 - np.argmin([*judged, np.inf]) >= patience

@@ -30,11 +30,13 @@ RUNS = 4  # runs that are filtered together
 
 
 class Log(NamedTuple):
-    """One simulated run: what happened and what the robot was told of it."""
+    """One run, simulated or recorded: what happened and what the robot was told of it."""
 
-    truth: Array  # (T, 3) pose at each scan, world frame
+    truth: Array  # (T, 3) pose at each scan, world frame; the first is where the filter starts
     motion: Array  # (T, 3) odometry since the scan before, zero at the first
     nodes: Nodes  # [T] features of each scan
+    known: Array | None = None  # (T, M) int32 landmark each feature is, -1 unknown; or match
+    judged: Array | None = None  # (T,) bool, where the truth is known; everywhere unless given
 
 
 class Track(NamedTuple):
@@ -47,6 +49,7 @@ class Track(NamedTuple):
     matches: Array  # (T,) int32 features that updated the state
     landmarks: Array  # () int32 landmarks that count at the end
     finite: Array  # () bool
+    judged: Array  # (T,) bool, where the truth is known
 
 
 def start(path: Array) -> Array:
@@ -162,7 +165,7 @@ def dead_reckoning(first: Array, told: Array) -> Array:
 def track(config: Config, noise: Noise, log: Log) -> Track:
     """Filter one run from its true start."""
     belief, info = slam.run(
-        config, noise, slam.init(config, log.truth[0]), Inputs(log.motion, log.nodes)
+        config, noise, slam.init(config, log.truth[0]), Inputs(log.motion, log.nodes, log.known)
     )
     return Track(
         truth=log.truth,
@@ -172,6 +175,7 @@ def track(config: Config, noise: Noise, log: Log) -> Track:
         matches=jnp.sum(info.used, axis=1, dtype=jnp.int32),
         landmarks=jnp.sum(belief.seen >= slam.needed(config, belief.kind), dtype=jnp.int32),
         finite=jnp.all(info.finite),
+        judged=jnp.ones(len(log.truth), bool) if log.judged is None else log.judged,
     )
 
 
@@ -228,7 +232,7 @@ def experiment(
 
 
 def evaluate(tracks: Track) -> dict:
-    """Errors over all steps of all runs, with the keys of `metrics.json`.
+    """Errors over all steps whose truth is known, with the keys of `metrics.json`.
 
     A run has diverged when its final position error exceeds 1 m or is no number; runs with
     numbers that are none are counted there and left out of the means.
@@ -237,24 +241,33 @@ def evaluate(tracks: Track) -> dict:
     good = tracks.finite & np.all(np.isfinite(tracks.estimate), axis=(1, 2))
     error = np.asarray(pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth)))
     blind = np.asarray(pose_error(jnp.asarray(tracks.odometry), jnp.asarray(tracks.truth)))
-    final = np.linalg.norm(error[:, -1, :2], axis=-1)
-    diverged = np.flatnonzero(~good | ~(final <= 1.0))
+    far = ~(np.linalg.norm(_last(error, tracks.judged)[:, :2], axis=-1) <= 1.0)
+    diverged = np.flatnonzero(~good | far)
     # Until the first motion the pose is certain, and NEES has no meaning.
     ratio = np.asarray(nees(jnp.asarray(error), jnp.asarray(tracks.cov)))
     certain = np.trace(tracks.cov, axis1=-2, axis2=-1) < 1e-12
-    use = good[:, None] & ~certain & np.isfinite(ratio)
+    judged = good[:, None] & tracks.judged
+    use = judged & ~certain & np.isfinite(ratio)
     return {
         "runs": len(error),
         "scans": int(error.shape[0] * error.shape[1]),
-        **errors(error[good]),
+        **errors(error[judged]),
         "nees": float(np.mean(ratio[use]) / 3) if use.any() else None,
         "diverged": len(diverged),
         "diverged_runs": diverged.tolist(),
         "landmarks": float(np.mean(tracks.landmarks)),
         "matches": float(np.mean(tracks.matches)),
-        "dead_reckoning": errors(blind[good])
-        | {"diverged": int(np.sum(np.linalg.norm(blind[:, -1, :2], axis=-1) > 1.0))},
+        "dead_reckoning": errors(blind[judged])
+        | {
+            "diverged": int(np.sum(np.linalg.norm(_last(blind, tracks.judged)[:, :2], axis=-1) > 1))
+        },
     }
+
+
+def _last(error: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Errors (B, 3) at the last of the steps (B, T) whose truth is known, of errors (B, T, 3)."""
+    at = judged.shape[1] - 1 - np.argmax(judged[:, ::-1], axis=1)
+    return error[np.arange(len(error)), at]
 
 
 def errors(error: np.ndarray) -> dict:

@@ -128,14 +128,14 @@ def find_walls(runs: Runs, spec: NodeSpec) -> Nodes:
     )
 
 
-def from_polar(polar: Array, valid: Array) -> Nodes:
+def from_polar(polar: Array, valid: Array, part: float = 0.0) -> Nodes:
     """Features of a sensor that itself tells range and bearing of landmarks.
-
-    Their own covariance is zero: what the filter assumes of range and bearing is all.
 
     Args:
         polar: (M, 2) range [m] and bearing [rad].
         valid: (M,) bool, False marks padding.
+        part: Their own standard deviation is this part of their range, along it. By default there
+            is none: what the filter assumes of range and bearing is all.
 
     Raises:
         ValueError: An argument has another shape or type; while tracing.
@@ -144,11 +144,12 @@ def from_polar(polar: Array, valid: Array) -> Nodes:
     expect("valid", valid, polar.shape[:1], jnp.bool_)
     count = valid.size
     zero, none = jnp.zeros(count, polar.dtype), jnp.zeros(count, bool)
+    xy = polar[:, :1] * unit(polar[:, 1])
     return blank(
         Nodes(
             kind=jnp.full(count, NODE, jnp.int32),
-            xy=polar[:, :1] * unit(polar[:, 1]),
-            cov=jnp.zeros((count, 2, 2), polar.dtype),
+            xy=xy,
+            cov=part**2 * xy[:, :, None] * xy[:, None],
             direction=zero,
             variance=zero,
             shape=zero + 1.0,

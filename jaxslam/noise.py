@@ -1,4 +1,4 @@
-"""Noise the filter assumes of odometry and features, for two kinds of robot."""
+"""Noise the filter assumes of odometry and features, for three kinds of robot."""
 
 from typing import NamedTuple
 
@@ -47,6 +47,11 @@ def wheel_noise(robot: Robot) -> Noise:
 def log_noise() -> Noise:
     """Noise for recorded logs of unknown robots: cautious."""
     return _noise(jnp.full(4, 0.05), range=0.05, bearing=0.01, scale=1.5, wall=0.03)
+
+
+def sighting_noise() -> Noise:
+    """Noise one would set by hand for a small robot that reads range and bearing of landmarks."""
+    return _noise(jnp.full(4, 0.1), range=0.15, bearing=0.03, scale=1.0, wall=0.03)
 
 
 def _noise(odometry: Array, **rest: float) -> Noise:

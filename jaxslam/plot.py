@@ -260,3 +260,27 @@ def roads(axis: Axes, graph: Graph) -> None:
         if use.any():
             edge = {"markeredgewidth": 0.4, "linestyle": "none"}
             axis.plot(*graph.xy[use].T, marker, label=name, **style, **edge)
+
+
+def losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> None:
+    """Draw losses over the evaluations (N,) of a fit, those of held-out runs where not NaN."""
+    steps = np.arange(len(training))
+    axis.plot(steps, training, color=SKY, label="training")
+    judged = np.isfinite(heldout)
+    if judged.any():
+        axis.plot(steps[judged], heldout[judged], color=ORANGE, linestyle="--", label="held out")
+    axis.axvline(best, color=GREY, linewidth=0.8, label="best")
+    axis.set(xlabel="evaluation", ylabel="loss")
+    axis.legend(frameon=False)
+
+
+def parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, best: int) -> None:
+    """Draw parameters (N, P) over the evaluations of a fit, in units of where they began."""
+    colours = (BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK, GREY)
+    styles = ("-", "--", "-.", ":")
+    for i, (name, values) in enumerate(zip(names, history.T, strict=True)):
+        look = {"color": colours[i % len(colours)], "linestyle": styles[i % len(styles)]}
+        axis.plot(values / values[0], label=name, **look)
+    axis.axvline(best, color=GREY, linewidth=0.8)
+    axis.set(xlabel="evaluation", ylabel="noise / noise at the start", yscale="log")
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

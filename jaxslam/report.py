@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import lidar, metrics
+from jaxslam.fit import Fit, names
 from jaxslam.io import geojson, tum
 from jaxslam.io.occupancy import Occupancy
 from jaxslam.io.output import write_json
@@ -244,3 +245,37 @@ def tell_map(numbers: Numbers, title: str, out: Path) -> None:
     print(f"{numbers['left_out_m2']:10.1f}")
     print(f"  {'seconds':30}{numbers['seconds']['run']:10.1f}")
     print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, map.graphml")
+
+
+def draw_history(path: Path, found: Fit) -> None:
+    """Draw how a fit went."""
+    from jaxslam import plot  # matplotlib takes its time to load
+
+    figure, axes = plot.canvas(11.0, 4.0, 1, 2)
+    plot.losses(axes[0, 0], found.loss, found.heldout, found.best)
+    values = [np.asarray(x).reshape(len(found.loss), -1) for x in found.history]
+    plot.parameters(axes[0, 1], names(found.noise), np.concatenate(values, axis=1), found.best)
+    figure.savefig(path)
+
+
+def tell_tuning(numbers: Numbers, title: str, out: Path) -> None:
+    """Print a summary of what `metrics.json` holds of a fit."""
+    before = numbers["before"]
+    print(f"\n{title}; {numbers['evaluations']} evaluations, judged on {numbers['judged_on']}")
+    print(f"  {'':30}{'before':>12}{'after':>12}")
+    rows = {"loss": "loss", "position_rmse_m": "position RMSE [m]", "nees": "NEES / dof"}
+    rows |= {"heading_rmse_deg": "heading RMSE [deg]", "diverged": "runs diverged"}
+    for key, name in rows.items():
+        if numbers.get(key) is not None and before.get(key) is not None:
+            print(f"  {name:30}{before[key]:12.4g}{numbers[key]:12.4g}")
+    sure = numbers["standard_errors"] or {}
+    print(f"  {'noise':30}{'':12}{'after':>12}{'standard error' if sure else '':>18}")
+    fields = numbers["noise"]
+    flat = np.concatenate([np.ravel(x) for x in fields])
+    for name, value in zip(names(fields), flat, strict=True):
+        error = sure.get(name, np.nan)
+        known = "" if np.isnan(error) else "unknown" if np.isinf(error) else f"{error:.0%}"
+        print(f"  {name:30}{'':12}{value:12.4g}{known:>18}")
+    for warning in numbers["warnings"]:
+        print(f"warning: {warning}")
+    print(f"results: {out}{os.sep}noise.json, metrics.json, history.png")

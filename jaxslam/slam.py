@@ -23,6 +23,7 @@ from jaxslam.motion import process_noise
 from jaxslam.nodes import Nodes, NodeSpec
 from jaxslam.noise import Noise, sensor_noise
 from jaxslam.noise import log_noise as log_noise
+from jaxslam.noise import sighting_noise as sighting_noise
 from jaxslam.noise import wheel_noise as wheel_noise
 from jaxslam.recognition import MatchSpec, identify, overdue, recognise, second_look, twin
 from jaxslam.types import CORNER, NODE, WALL, Array

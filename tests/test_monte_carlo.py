@@ -134,6 +134,7 @@ def track(final, *, finite=True, nan=False):
         matches=np.array([0, 3], np.int32),
         landmarks=np.int32(4),
         finite=np.bool_(finite),
+        judged=np.ones(2, bool),
     )
 
 

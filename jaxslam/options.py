@@ -1,0 +1,47 @@
+"""What the commands share: options that are checked, errors that name them, compiled programs."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+
+from jaxslam.io import noise as noise_file
+from jaxslam.io.errors import InputError
+from jaxslam.slam import Noise
+
+
+def within(option: str, value: float, low: float, high: float) -> None:
+    """Raise unless the value of an option is in its range."""
+    if not low <= value <= high:
+        raise InputError(f"{value} is not between {low} and {high}", field=option)
+
+
+@contextmanager
+def named(what: str) -> Iterator[None]:
+    """Turn a ValueError of the block into an InputError that names the option or file."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(str(error), field=what) from None
+
+
+def noise_of(path: Path | None, default: Noise) -> Noise:
+    """Noise in a file; the default without one."""
+    return default if path is None else noise_file.read(path, default)
+
+
+def keep_compiled() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told of another one."""
+    if jax.config.jax_compilation_cache_dir is not None:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    cache = Path(home) / "jaxslam"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(cache, os.W_OK | os.X_OK):
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

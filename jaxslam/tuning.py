@@ -1,0 +1,295 @@
+"""The command `jaxslam tune`: noise fitted to simulated drives or to recorded logs."""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from jaxslam import curvature, fit, losses, monte_carlo, plan, report, slam
+from jaxslam import logs as log_of
+from jaxslam import world as worlds
+from jaxslam.io import carmen, checkpoint, mrclam, tum
+from jaxslam.io import noise as noise_file
+from jaxslam.io.errors import InputError
+from jaxslam.io.output import folder, write_json
+from jaxslam.losses import Loss
+from jaxslam.monte_carlo import Log
+from jaxslam.motion import Robot
+from jaxslam.options import keep_compiled, named, noise_of, within
+from jaxslam.slam import Config, Noise
+from jaxslam.world import World
+
+LANDMARKS = 256  # room for those of a recorded log of scans
+CONFIRM = 3  # sightings from which one counts there
+CHECKPOINT = "tune.npz"
+
+
+class Job(NamedTuple):
+    """What is tuned, and on what."""
+
+    config: Config
+    noise: Noise  # to start from
+    train: Log  # [B]
+    test: Log | None  # [H]
+    title: str
+
+
+def tune(
+    logs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[LOG ...]")
+    ] = (),
+    test: tuple[Path, ...] = (),
+    reference: tuple[Path, ...] = (),
+    world: str = "office",
+    runs: int = 32,
+    heldout: int = 16,
+    loss: Literal["calibrated", "localisation", "likelihood"] = "calibrated",
+    steps: int = 30,
+    batch: int | None = None,
+    patience: int | None = None,
+    freeze: tuple[str, ...] = (),
+    noise: Path | None = None,
+    seed: int = 0,
+    out: Path = Path("out"),
+) -> None:
+    """Fit the noise that the filter assumes, on recorded logs or on simulated drives.
+
+    Writes noise.json, which --noise of the other commands reads, metrics.json with the errors
+    before and after and the standard errors of the parameters, and history.png. When it is
+    stopped, noise.json holds the best so far, and the same command goes on from there.
+
+    Tuned are the odometry's four coefficients and the sensor's range, bearing, scale and wall, by
+    gradient. What decides which feature is which landmark, such as the gate, is not smooth and is
+    not tuned.
+
+    Args:
+        logs: CARMEN logs with FLASER lines, or folders of MRCLAM data sets (FOLDER for all of its
+            robots, FOLDER/Robot2 for one); none: simulated drives.
+        test: Logs to judge by, which nothing is tuned on.
+        reference: A TUM file for each CARMEN log, first of those to tune on, then of --test; MRCLAM
+            data sets bring their own.
+        world: Where simulated drives are.
+        runs: Simulated drives to tune on.
+        heldout: And to judge by.
+        loss: What is to be small: calibrated, localisation with a covariance that fits its errors;
+            localisation alone, which leaves the size of the noise open; or the (negative)
+            likelihood of what was observed, the only one that needs no reference.
+        steps: Updates.
+        batch: Drives that each step sees, in turn; by default all.
+        patience: Stop after as many judgements without a better one; by default never.
+        freeze: Parameters that stay: odometry, odometry[0] ... odometry[3], range, bearing, scale,
+            wall.
+        noise: File of the noise to start from; by default a cautious one.
+        seed: Of the simulated drives and of the order of batches.
+        out: Folder for the results.
+    """
+    within("--steps", steps, 1, 10**5)
+    within("--seed", seed, 0, 2**32 - 1)
+    within("--batch", 1 if batch is None else batch, 1, 10**6)
+    within("--patience", 1 if patience is None else patience, 1, 10**6)
+    chosen = losses.BY_NAME[loss]
+    with named("--freeze"):
+        fit.free(slam.log_noise(), freeze)
+    if logs:
+        make = _recorded(logs, test, reference, noise, chosen)
+    else:
+        if test or reference:
+            raise InputError("go with recorded logs", field="--test, --reference")
+        within("--runs", runs, 1, 10**6)
+        within("--heldout", heldout, 0, 10**6)
+        make = _simulated(world, runs, heldout, noise, seed)
+    begin = perf_counter()
+    with folder(out) as place:
+        out.mkdir(parents=True, exist_ok=True)
+        keep_compiled()
+        job = make()
+        options = {"loss": chosen, "frozen": freeze}
+        how = {"steps": steps, "batch": batch, "seed": seed, "patience": patience}
+        found = _descend(job, out, options, **how)
+        numbers = _judge(job, found, options) | {"seconds": perf_counter() - begin}
+        noise_file.write(place / "noise.json", found.noise)
+        write_json(place / "metrics.json", numbers)
+        report.draw_history(place / "history.png", found)
+    (out / CHECKPOINT).unlink(missing_ok=True)
+    report.tell_tuning(numbers, job.title, out)
+
+
+def _simulated(world: str, runs: int, heldout: int, noise: Path | None, seed: int) -> Any:
+    """What makes the job of simulated drives, after all that was asked for is checked."""
+    with named("--world"):
+        known = World(jnp.asarray(worlds.named(world).walls, float))
+        path = jnp.asarray(plan.densify(worlds.drive(world)), float)
+    start = noise_of(noise, slam.log_noise())
+
+    def make() -> Job:
+        config, robot = Config(), Robot()
+        steps = monte_carlo.drive_steps(robot, path)
+        total = runs + heldout
+        print(f"simulating {total} drives of {steps} scans, world {world}", flush=True)
+        logs = monte_carlo.simulate(
+            jax.random.key(seed), config, known, robot, path, runs=total, steps=steps
+        )
+        train, test = (
+            jax.tree.map(lambda x: np.asarray(x)[part], logs)  # noqa: B023
+            for part in (slice(runs), slice(runs, total))
+        )
+        title = f"{runs} drives in world {world}"
+        return Job(config, start, train, test if heldout else None, title)
+
+    return make
+
+
+def _recorded(
+    logs: Sequence[Path],
+    test: Sequence[Path],
+    reference: Sequence[Path],
+    noise: Path | None,
+    loss: Loss,
+) -> Any:
+    """What makes the job of recorded logs, after all files are read and checked."""
+    groups = [[_robots(path) for path in some] for some in (logs, test)]
+    named_ones = {found is not None for some in groups for found in some}
+    if len(named_ones) > 1:
+        raise InputError("CARMEN logs and MRCLAM data sets are tuned apart", field="LOG")
+    if named_ones == {True}:
+        if reference:
+            raise InputError("MRCLAM data sets bring their own", field="--reference")
+        start = noise_of(noise, slam.sighting_noise())
+        parts = [
+            [mrclam.read(folder, robot) for found in some for folder, robot in found]
+            for some in groups
+        ]
+        config = log_of.config_of(parts[0] + parts[1])
+        read = log_of.from_sightings
+        blind = [not one.referenced.any() for some in parts for one in some]
+    else:
+        start = noise_of(noise, slam.log_noise())
+        every = [carmen.read(path) for path in (*logs, *test)]
+        if reference and len(reference) != len(every):
+            problem = f"{len(reference)} files for {len(every)} logs"
+            raise InputError(problem, field="--reference", advice="give one for each log, in order")
+        known = [tum.read(path) for path in reference] or [None] * len(every)
+        other = [i for i, one in enumerate(every) if one.lidar != every[0].lidar]
+        if other:
+            problem = f"has another scanner than {logs[0]}"
+            raise InputError(problem, path=(*logs, *test)[other[0]], advice="tune them apart")
+        config = Config(lidar=every[0].lidar, landmarks=LANDMARKS, confirm=CONFIRM)
+        pairs = list(zip(every, known, strict=True))
+        parts = pairs[: len(logs)], pairs[len(logs) :]
+
+        def read(pair: tuple) -> Log:
+            with named("--reference"):
+                return log_of.from_recording(pair[0], config, pair[1])
+
+        blind = [one is None for one in known]
+    if losses.needs_truth(loss) and any(blind):
+        problem = f"a log has no reference, which the loss {loss.__name__} needs"
+        raise InputError(problem, advice="give --reference, or use --loss likelihood")
+
+    def make() -> Job:
+        train, tests = ([read(one) for one in some] for some in parts)
+        title = f"{len(train)} logs, {sum(len(one.truth) for one in train)} steps"
+        print(f"{title}; to judge by: {len(tests)}", flush=True)
+        heldout = log_of.stack(tests) if tests else None
+        return Job(config, start, log_of.stack(train), heldout, title)
+
+    return make
+
+
+def _robots(path: Path) -> list[tuple[Path, int]] | None:
+    """Folder and number of the robots of an MRCLAM data set that a path means; None: no such."""
+    if (path / "Barcodes.dat").is_file():
+        return [(path, robot) for robot in mrclam.robots(path)]
+    one = re.fullmatch(r"Robot(\d+)(_\w+\.dat)?", path.name)
+    if one and (path.parent / "Barcodes.dat").is_file():
+        return [(path.parent, int(one[1]))]
+    return None
+
+
+def _descend(job: Job, out: Path, options: dict[str, Any], **how: int | None) -> fit.Fit:
+    """Tune, from where the last call stopped; keep where it stands after each evaluation."""
+    about = {
+        "config": repr(job.config),
+        "loss": options["loss"].__name__,
+        "frozen": sorted(options["frozen"]),
+        **how,
+        "noise to start from": job.noise,
+        "runs": _hash(job.train),
+        "heldout": _hash(job.test),
+    }
+    file, state, steps, batch = out / CHECKPOINT, None, how["steps"], how["batch"]
+    if file.exists():
+        begun = fit.begin(job.noise, steps=steps, frozen=options["frozen"])
+        state = checkpoint.read(file, begun, about)
+        print(f"going on after evaluation {int(state.step)} of {steps + 1}", flush=True)
+    whole = batch is None or batch >= len(job.train.motion)
+    done = 0 if state is None else int(state.step)
+    bar = tqdm(total=steps + 1, initial=done, unit="step", desc="tuning", mininterval=0)
+
+    def keep(state: fit.State) -> None:
+        nonlocal done
+        done = int(state.step)
+        noise_file.write(out / "noise.json", fit.result(state, job.noise, whole=whole).noise)
+        checkpoint.write(file, state, about)
+        judged = state.heldout[np.isfinite(state.heldout)]
+        shown = {"loss": f"{state.loss[done - 1]:.4g}"}
+        shown |= {"heldout": f"{judged[-1]:.4g}"} if judged.size else {}
+        bar.set_postfix(shown, refresh=False)
+        bar.update(done - bar.n)
+
+    given = {"heldout": job.test, "state": state, "report": keep, **how, **options}
+    try:
+        with bar:
+            return fit.tune(job.noise, job.config, job.train, **given)
+    except KeyboardInterrupt:
+        if not done:
+            raise
+        raise KeyboardInterrupt(
+            f"interrupted after {done} of {steps + 1} evaluations; {out / 'noise.json'} holds the "
+            "best so far, and the same command goes on from here"
+        ) from None
+
+
+def _judge(job: Job, found: fit.Fit, options: dict[str, Any]) -> report.Numbers:
+    """Numbers of a fit: errors before and after, and how sure it is of its parameters."""
+    runs = job.train if job.test is None else job.test
+
+    def errors(noise: Noise) -> report.Numbers:
+        loss = fit.values(noise, job.config, runs, options["loss"])
+        numbers = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
+        if runs.judged is None or runs.judged.any():
+            numbers |= monte_carlo.evaluate(monte_carlo.tracks(job.config, noise, runs))
+        return numbers
+
+    print("errors before and after, standard errors of the parameters ...", flush=True)
+    numbers = errors(found.noise) | {
+        "judged_on": "the runs it was tuned on" if job.test is None else "held-out runs",
+        "before": errors(job.noise),
+        "evaluations": len(found.loss),
+        "best": found.best,
+        "skipped": int(found.skipped.sum()),
+        "noise": found.noise,
+        "standard_errors": None,
+        "warnings": [],
+    }
+    if len(job.train.motion) >= 2:
+        sure = curvature.standard_errors(found.noise, job.config, job.train, **options)
+        relative = dict(zip(sure.names, sure.relative, strict=True))
+        numbers |= {"standard_errors": relative, "warnings": list(sure.warnings)}
+    return numbers
+
+
+def _hash(logs: Log | None) -> str:
+    """What tells logs from others."""
+    total = hashlib.sha256()
+    for leaf in jax.tree.leaves(logs):
+        total.update(np.ascontiguousarray(leaf).tobytes())
+    return total.hexdigest()[:16]

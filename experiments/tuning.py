@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from experiments import common
 from jaxslam import fit, monte_carlo, slam
+from jaxslam.losses import calibrated
 
 FACTOR = 3.0
 
@@ -29,11 +30,11 @@ def compute(seed: int, runs: int, heldout: int, steps: int) -> common.Numbers:
     start = jax.tree.map(lambda x: FACTOR * x, truth)
     with tqdm(total=steps + 1, unit="step", leave=False) as bar:
 
-        def report(step: int, loss: float) -> None:
-            bar.set_postfix(loss=f"{loss:.2e}")
+        def report(state: fit.State) -> None:
+            bar.set_postfix(loss=f"{state.loss[state.step - 1]:.4g}")
             bar.update()
 
-        found = fit.tune(start, config, train, steps=steps, report=report)
+        found = fit.tune(start, config, train, loss=calibrated, steps=steps, report=report)
     judged = {
         name: monte_carlo.evaluate(monte_carlo.tracks(config, noise, test))
         for name, noise in (("start", start), ("tuned", found.noise), ("true_noise", truth))
@@ -59,8 +60,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     """Loss and noise over the steps, errors before and after."""
     figure, axes = common.canvas(12, 3.6, 1, 3)
     loss, bars, noise = axes[0]
-    loss.plot(np.sqrt(numbers["loss"]), color=common.BLUE)
-    loss.set(xlabel="step", ylabel="training error [m]")
+    loss.plot(numbers["loss"], color=common.BLUE)
+    loss.set(xlabel="step", ylabel="training loss [nats a pose]")
     names = ("start", "tuned", "true_noise")
     drawn = bars.bar(
         [name.replace("_", "\n") for name in names],

@@ -59,33 +59,50 @@ def standard_errors(
     runs = logs.motion.shape[0]
     if runs < 2:
         raise ValueError("standard errors need two runs or more")
-    moves = fit.free(noise, frozen)
-    at = np.flatnonzero(moves)
+    h, each = second_derivatives(noise, config, logs, loss=loss, frozen=frozen)
+    return _errors(fit.names(noise), fit.free(noise, frozen), h, each.T @ each / len(each), runs)
+
+
+def second_derivatives(
+    noise: Noise, config: Config, logs: Log, *, loss: Loss, frozen: Collection[str] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean second derivatives (F, F) over runs in the F free parameters, as logarithms.
+
+    Returns:
+        They, and the gradients (G, F) of those runs that have one.
+    """
+    at = np.flatnonzero(fit.free(noise, frozen))
     values, each = fit.gradients(noise, config, logs, loss)
     good = np.isfinite(values) & np.isfinite(each).all(axis=1)
-    columns = []
-    for i in at:
-        sides = []
-        for sign in (1, -1):
-            value, slope = fit.gradients(fit.scaled(noise, i, sign * STEP), config, logs, loss)
-            sides.append(fit.mean_gradient(value, slope)[1])
-        columns.append((sides[0] - sides[1])[at] / (2 * STEP))
-    spread = each[good][:, at]
-    return _errors(
-        fit.names(noise), moves, np.array(columns), spread.T @ spread / len(spread), runs
-    )
+
+    def slope(parameter: int, by: float) -> np.ndarray:
+        beside = fit.scaled(noise, parameter, by)
+        return fit.mean_gradient(*fit.gradients(beside, config, logs, loss))[1][at]
+
+    h = np.stack([(slope(i, STEP) - slope(i, -STEP)) / (2 * STEP) for i in at])
+    return (h + h.T) / 2, each[good][:, at]
+
+
+def _known(h: np.ndarray, j: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of curvature H and outer products J (F, F): what the data tell.
+
+    Returns:
+        Whether they tell of each direction (F,), the inverse (F, F) of H in those they do, and the
+        share (F,) of each parameter in the others.
+    """
+    curvature, direction = np.linalg.eigh(h)
+    variance = np.einsum("ik,ij,jk->k", direction, j, direction) / runs
+    told = (curvature > 0.0) & (variance < curvature**2)
+    inverse = direction[:, told] / curvature[told] @ direction[:, told].T
+    return told, inverse, np.sum(direction[:, ~told] ** 2, axis=1)
 
 
 def _errors(
     names: tuple[str, ...], moves: np.ndarray, h: np.ndarray, j: np.ndarray, runs: int
 ) -> Errors:
     """Standard errors of H and J (F, F) of the free parameters."""
-    curvature, direction = np.linalg.eigh((h + h.T) / 2)
-    variance = np.einsum("ik,ij,jk->k", direction, j, direction) / runs
-    told = (curvature > 0.0) & (variance < curvature**2)
-    known = direction[:, told] / np.where(told, curvature, 1.0)[told] @ direction[:, told].T
+    _, known, unknown = _known(h, j, runs)
     own = known @ j @ known / runs
-    unknown = np.sum(direction[:, ~told] ** 2, axis=1)
     relative = np.where(unknown < SHARE, np.sqrt(np.diag(own)), np.inf)
     sure = relative < SURE
 

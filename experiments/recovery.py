@@ -1,7 +1,7 @@
 """Drives for which the filter's model is exactly true, so that tuning has a right answer.
 
-They go through the office. Odometry errs by a draw of its process noise, and of up to six landmarks near by, told apart, and of the
-direction of the walls, the robot sees a draw of the sensor noise.
+They go through the office. Odometry errs by a draw of its process noise. Up to six landmarks near
+by, which are told apart, and the direction of the walls are seen with a draw of the sensor noise.
 """
 
 from functools import partial
@@ -25,9 +25,7 @@ PLACES = 40  # landmarks; the next number is the direction of the walls
 SEEN = 6  # of them in a scan at most
 NEAR, FAR = 0.7, 4.0  # [m] from which to which the robot sees them
 OWN, OWN_WALL = 0.004, 0.002  # [m], [rad] about which their own standard deviation is
-CONFIG = Config(
-    landmarks=PLACES + 1, matches=SEEN + 1, fresh=SEEN + 1, kinds=(NODE, WALL)
-)  # fmt: skip
+CONFIG = Config(landmarks=PLACES + 1, matches=SEEN + 1, fresh=SEEN + 1, kinds=(NODE, WALL))
 
 
 def truth() -> Noise:

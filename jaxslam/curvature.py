@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam import fit
-from jaxslam.losses import Loss, localisation
+from jaxslam.losses import Loss, calibrated
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Noise
 
@@ -30,7 +30,7 @@ def standard_errors(
     config: Config,
     logs: Log,
     *,
-    loss: Loss = localisation,
+    loss: Loss = calibrated,
     frozen: Collection[str] = (),
 ) -> Errors:
     """Standard errors of a fit, from the curvature of its loss and how its runs disagree.

@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxslam import slam
 from jaxslam.batches import Spread
-from jaxslam.losses import Loss, localisation, needs_truth
+from jaxslam.losses import Loss, calibrated, needs_truth
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array
@@ -114,13 +114,13 @@ _VALUES = Spread(_value, size=GROUP, static=2)
 _GRADIENTS = Spread(_value_and_gradient, size=GROUP, static=2)
 
 
-def values(noise: Noise, config: Config, logs: Log, loss: Loss = localisation) -> np.ndarray:
+def values(noise: Noise, config: Config, logs: Log, loss: Loss = calibrated) -> np.ndarray:
     """Loss (B,) float64 of each run."""
     return np.asarray(_VALUES(config, loss, unconstrain(noise), logs), np.float64)
 
 
 def gradients(
-    noise: Noise, config: Config, logs: Log, loss: Loss = localisation
+    noise: Noise, config: Config, logs: Log, loss: Loss = calibrated
 ) -> tuple[np.ndarray, np.ndarray]:
     """Loss (B,) of each run and its gradient (B, P) in the logarithms of the noise, float64."""
     both = _GRADIENTS(config, loss, unconstrain(noise), logs)
@@ -172,7 +172,7 @@ def tune(
     config: Config,
     logs: Log,
     *,
-    loss: Loss = localisation,
+    loss: Loss = calibrated,
     optimiser: optax.GradientTransformation | None = None,
     steps: int = 30,
     batch: int | None = None,

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from experiments import recovery
@@ -129,16 +130,10 @@ def test_the_best_is_that_of_the_heldout_runs_or_of_all_or_the_last():
 
 
 def test_it_stops_when_it_gets_no_better(logs):
-    climbs = tuned(logs, steps=9, heldout=logs, patience=2, optimiser=uphill(0.2))
+    climbs = tuned(logs, steps=9, heldout=logs, patience=2, optimiser=optax.sgd(-0.2))
     assert len(climbs.loss) == 3 and climbs.best == 0
     falls = tuned(logs, steps=5, heldout=logs, patience=2)
     assert len(falls.loss) == 6
-
-
-def uphill(rate):
-    import optax
-
-    return optax.sgd(-rate)
 
 
 @pytest.mark.parametrize(
@@ -189,11 +184,8 @@ def test_standard_errors_are_those_of_the_sandwich(logs, monkeypatch):
     a = root @ root.swapaxes(1, 2) + np.eye(P)
     centres = np.log(flat(TRUTH)) + 0.1 * rng.normal(size=(B, P))
     least = np.linalg.solve(a.sum(axis=0), np.einsum("bij,bj->i", a, centres))
-    noise = jax.tree.unflatten(
-        jax.tree.structure(TRUTH), [np.exp(least[:4]), *np.exp(least[4:])]
-    )  # fmt: skip
+    noise = type(TRUTH)(*map(jnp.asarray, [np.exp(least[:4]), *np.exp(least[4:])]))
     quadratic(monkeypatch, a, centres)
-    noise = jax.tree.map(jnp.asarray, noise)
     found = curvature.standard_errors(noise, CONFIG, logs)
     slopes = np.einsum("bij,bj->bi", a, least - centres)
     inverse = np.linalg.inv(a.mean(axis=0))

@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxslam: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
-        print(f"jaxslam: {stop or 'interrupted, nothing written'}", file=sys.stderr)
+        print(f"jaxslam: {str(stop) or 'interrupted, nothing written'}", file=sys.stderr)
         return 130
     return 0
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import Affine2D
 
 from jaxslam.belief import Belief
@@ -271,6 +272,7 @@ def losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> 
         axis.plot(steps[judged], heldout[judged], color=ORANGE, linestyle="--", label="held out")
     axis.axvline(best, color=GREY, linewidth=0.8, label="best")
     axis.set(xlabel="evaluation", ylabel="loss")
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     axis.legend(frameon=False)
 
 
@@ -283,4 +285,8 @@ def parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, best: in
         axis.plot(values / values[0], label=name, **look)
     axis.axvline(best, color=GREY, linewidth=0.8)
     axis.set(xlabel="evaluation", ylabel="noise / noise at the start", yscale="log")
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -269,13 +269,13 @@ def tell_tuning(numbers: Numbers, title: str, out: Path) -> None:
         if numbers.get(key) is not None and before.get(key) is not None:
             print(f"  {name:30}{before[key]:12.4g}{numbers[key]:12.4g}")
     sure = numbers["standard_errors"] or {}
-    print(f"  {'noise':30}{'':12}{'after':>12}{'standard error' if sure else '':>18}")
-    fields = numbers["noise"]
-    flat = np.concatenate([np.ravel(x) for x in fields])
-    for name, value in zip(names(fields), flat, strict=True):
+    if sure:
+        print(f"  {'noise':30}{'':24}{'standard error':>18}")
+    old, new = (np.concatenate([np.ravel(x) for x in of["noise"]]) for of in (before, numbers))
+    for name, *values in zip(names(numbers["noise"]), old, new, strict=True):
         error = sure.get(name, np.nan)
         known = "" if np.isnan(error) else "unknown" if np.isinf(error) else f"{error:.0%}"
-        print(f"  {name:30}{'':12}{value:12.4g}{known:>18}")
+        print(f"  {name:30}{values[0]:12.4g}{values[1]:12.4g}{known:>18}".rstrip())
     for warning in numbers["warnings"]:
         print(f"warning: {warning}")
     print(f"results: {out}{os.sep}noise.json, metrics.json, history.png")

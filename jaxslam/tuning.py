@@ -2,7 +2,8 @@
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam import curvature, fit, losses, monte_carlo, plan, report, slam
+from jaxslam import curvature, fit, losses, metrics, monte_carlo, plan, report, slam
 from jaxslam import logs as log_of
 from jaxslam import world as worlds
 from jaxslam.io import carmen, checkpoint, mrclam, tum
@@ -29,7 +30,7 @@ from jaxslam.world import World
 
 LANDMARKS = 256  # room for those of a recorded log of scans
 CONFIRM = 3  # sightings from which one counts there
-CHECKPOINT = "tune.npz"
+NOISE, CHECKPOINT = "noise.json", "tune.npz"
 
 
 class Job(NamedTuple):
@@ -95,6 +96,9 @@ def tune(
     within("--seed", seed, 0, 2**32 - 1)
     within("--batch", 1 if batch is None else batch, 1, 10**6)
     within("--patience", 1 if patience is None else patience, 1, 10**6)
+    if noise is not None and noise.resolve() == (out / NOISE).resolve():
+        advice = "name another folder by --out"
+        raise InputError("would be replaced by what is found", path=noise, advice=advice)
     chosen = losses.BY_NAME[loss]
     with named("--freeze"):
         fit.free(slam.log_noise(), freeze)
@@ -108,14 +112,14 @@ def tune(
         make = _simulated(world, runs, heldout, noise, seed)
     begin = perf_counter()
     with folder(out) as place:
-        out.mkdir(parents=True, exist_ok=True)
         keep_compiled()
         job = make()
         options = {"loss": chosen, "frozen": freeze}
         how = {"steps": steps, "batch": batch, "seed": seed, "patience": patience}
         found = _descend(job, out, options, **how)
-        numbers = _judge(job, found, options) | {"seconds": perf_counter() - begin}
-        noise_file.write(place / "noise.json", found.noise)
+        with _stoppable(out, lambda: "all evaluations"):
+            numbers = _judge(job, found, options) | {"seconds": perf_counter() - begin}
+        noise_file.write(place / NOISE, found.noise)
         write_json(place / "metrics.json", numbers)
         report.draw_history(place / "history.png", found)
     (out / CHECKPOINT).unlink(missing_ok=True)
@@ -163,13 +167,17 @@ def _recorded(
         if reference:
             raise InputError("MRCLAM data sets bring their own", field="--reference")
         start = noise_of(noise, slam.sighting_noise())
-        parts = [
-            [mrclam.read(folder, robot) for found in some for folder, robot in found]
-            for some in groups
-        ]
-        config = log_of.config_of(parts[0] + parts[1])
+        robots = [[one for found in some for one in found] for some in groups]
+        parts = [[mrclam.read(*one) for one in some] for some in robots]
+        every = parts[0] + parts[1]
+        config = log_of.config_of(every)
         read = log_of.from_sightings
-        blind = [not one.referenced.any() for some in parts for one in some]
+        blind = [
+            folder / f"Robot{robot}"
+            for (folder, robot), one in zip(robots[0] + robots[1], every, strict=True)
+            if not one.referenced.any()
+        ]
+        advice = "use --loss likelihood"
     else:
         start = noise_of(noise, slam.log_noise())
         every = [carmen.read(path) for path in (*logs, *test)]
@@ -183,21 +191,22 @@ def _recorded(
             raise InputError(problem, path=(*logs, *test)[other[0]], advice="tune them apart")
         config = Config(lidar=every[0].lidar, landmarks=LANDMARKS, confirm=CONFIRM)
         pairs = list(zip(every, known, strict=True))
+        for path, (one, poses) in zip(reference, pairs, strict=False):
+            if not metrics.match_times(one.times, poses[0]).size:
+                advice = "compare their clocks, and the order of --reference"
+                raise InputError("has no pose at the time of a scan", path=path, advice=advice)
         parts = pairs[: len(logs)], pairs[len(logs) :]
-
-        def read(pair: tuple) -> Log:
-            with named("--reference"):
-                return log_of.from_recording(pair[0], config, pair[1])
-
-        blind = [one is None for one in known]
-    if losses.needs_truth(loss) and any(blind):
-        problem = f"a log has no reference, which the loss {loss.__name__} needs"
-        raise InputError(problem, advice="give --reference, or use --loss likelihood")
+        read = lambda pair: log_of.from_recording(pair[0], config, pair[1])
+        blind = [] if reference else logs
+        advice = "give --reference, or use --loss likelihood"
+    if losses.needs_truth(loss) and blind:
+        problem = f"has no reference, which the loss {loss.__name__} needs"
+        raise InputError(problem, path=blind[0], advice=advice)
 
     def make() -> Job:
         train, tests = ([read(one) for one in some] for some in parts)
-        title = f"{len(train)} logs, {sum(len(one.truth) for one in train)} steps"
-        print(f"{title}; to judge by: {len(tests)}", flush=True)
+        title = f"{len(train)} recorded drives, {sum(len(one.truth) for one in train)} steps"
+        print(f"{title}; held out: {len(tests)}", flush=True)
         heldout = log_of.stack(tests) if tests else None
         return Job(config, start, log_of.stack(train), heldout, title)
 
@@ -232,29 +241,37 @@ def _descend(job: Job, out: Path, options: dict[str, Any], **how: int | None) ->
         print(f"going on after evaluation {int(state.step)} of {steps + 1}", flush=True)
     whole = batch is None or batch >= len(job.train.motion)
     done = 0 if state is None else int(state.step)
-    bar = tqdm(total=steps + 1, initial=done, unit="step", desc="tuning", mininterval=0)
+    bar = tqdm(total=steps + 1, initial=done, desc="compiling", mininterval=0)
 
     def keep(state: fit.State) -> None:
         nonlocal done
         done = int(state.step)
-        noise_file.write(out / "noise.json", fit.result(state, job.noise, whole=whole).noise)
+        out.mkdir(parents=True, exist_ok=True)
+        noise_file.write(out / NOISE, fit.result(state, job.noise, whole=whole).noise)
         checkpoint.write(file, state, about)
         judged = state.heldout[np.isfinite(state.heldout)]
         shown = {"loss": f"{state.loss[done - 1]:.4g}"}
         shown |= {"heldout": f"{judged[-1]:.4g}"} if judged.size else {}
+        bar.set_description("tuning", refresh=False)
         bar.set_postfix(shown, refresh=False)
         bar.update(done - bar.n)
 
     given = {"heldout": job.test, "state": state, "report": keep, **how, **options}
+    with _stoppable(out, lambda: done and f"{done} of {steps + 1} evaluations"), bar:
+        return fit.tune(job.noise, job.config, job.train, **given)
+
+
+@contextmanager
+def _stoppable(out: Path, done: Callable[[], str | int]) -> Iterator[None]:
+    """Say of a Ctrl-C in the block how to go on, if anything is done."""
     try:
-        with bar:
-            return fit.tune(job.noise, job.config, job.train, **given)
+        yield
     except KeyboardInterrupt:
-        if not done:
+        if not done():
             raise
         raise KeyboardInterrupt(
-            f"interrupted after {done} of {steps + 1} evaluations; {out / 'noise.json'} holds the "
-            "best so far, and the same command goes on from here"
+            f"interrupted after {done()}; {out / NOISE} holds the best so far, and the "
+            "same command goes on from here"
         ) from None
 
 
@@ -272,7 +289,7 @@ def _judge(job: Job, found: fit.Fit, options: dict[str, Any]) -> report.Numbers:
     print("errors before and after, standard errors of the parameters ...", flush=True)
     numbers = errors(found.noise) | {
         "judged_on": "the runs it was tuned on" if job.test is None else "held-out runs",
-        "before": errors(job.noise),
+        "before": errors(job.noise) | {"noise": job.noise},
         "evaluations": len(found.loss),
         "best": found.best,
         "skipped": int(found.skipped.sum()),

@@ -185,7 +185,7 @@ def test_run_says_how_many_lines_it_skipped(done):
 @pytest.fixture
 def refused(tmp_path, capsys, monkeypatch):
     """Function that runs bad arguments, checks how they are refused, and returns the line."""
-    monkeypatch.setattr(cli, "_keep_compiled", lambda: None)
+    monkeypatch.setattr(cli, "keep_compiled", lambda: None)
 
     def refuse(*arguments):
         out = tmp_path / "results"
@@ -258,7 +258,7 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_keep_compiled", lambda: None)
+    monkeypatch.setattr(cli, "keep_compiled", lambda: None)
     monkeypatch.setattr(cli.monte_carlo, "drive_steps", stop)
     assert cli.main(["simulate", "--out", str(tmp_path / "out")]) == 130
     assert "interrupted" in capsys.readouterr().err

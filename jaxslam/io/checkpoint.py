@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import jax
 import numpy as np
@@ -60,10 +59,10 @@ def read(path: str | PathLike, template: Tree, about: Mapping[str, Any]) -> Tree
     """
     advice = "remove it to begin anew, or name another folder by --out"
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             found = json.loads(str(file[ABOUT]))
             leaves = [file[f"leaf{i}"] for i in range(len(file.files) - 1)]
-    except (OSError, ValueError, KeyError, EOFError, RecursionError, BadZipFile) as error:
+    except Exception as error:  # NumPy, zipfile and json list nowhere what damage raises
         problem = f"is no checkpoint ({type(error).__name__})"
         raise InputError(problem, path=path, advice=advice) from None
     wanted = plain(about)

@@ -1,0 +1,272 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference_filter
+
+from jaxslam import lidar, logs, losses, sensor, slam, world
+from jaxslam.io import carmen
+from jaxslam.io.recording import Recording, Sightings
+from jaxslam.slam import Config, Inputs
+from jaxslam.types import NODE
+
+SCANS, FIRST = 7, 2  # of a recording, and the first with a reference
+LIDAR = carmen.layout(91, 10.0)
+LOSSES = tuple(losses.BY_NAME.values())
+
+
+def sightings(seed, steps=9, most=3, landmarks=4):
+    """A drive of a robot that sees up to `most` of its landmarks, with noise."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-4.0, 4.0, (landmarks, 2))
+    motion = rng.normal([0.4, 0.0, 0.2], 0.05, (steps, 3)) * (np.arange(steps) > 0)[:, None]
+    truth, polar = [np.array([1.0, -2.0, 0.5])], np.zeros((steps, most, 2), np.float32)
+    valid, which = np.zeros((steps, most), bool), np.full((steps, most), -1, np.int32)
+    for t in range(steps):
+        if t:
+            truth.append(reference_filter.compose(truth[-1], motion[t] + rng.normal(0, 0.02, 3)))
+        for k, i in enumerate(rng.permutation(landmarks)[: rng.integers(0, most + 1)]):
+            seen, _ = reference_filter.observe(np.append(truth[t], places), i, NODE)
+            polar[t, k], valid[t, k], which[t, k] = seen + rng.normal(0, 0.02, 2), True, i
+    return Sightings(
+        times=np.arange(steps, dtype=float),
+        motion=motion,
+        polar=polar,
+        valid=valid,
+        which=which,
+        truth=np.array(truth),
+        referenced=rng.random(steps) < 0.8,
+        places=places,
+        names=np.arange(landmarks, dtype=np.int32) + 6,
+        skipped=0,
+    )
+
+
+def wheels_of(poses):
+    """What wheels report that begin elsewhere and drift."""
+    part = np.arange(len(poses)) / len(poses)
+    drift = np.stack([0.1 * part, 0.3 * part**2, 0.1 * part], axis=1)
+    return np.array([reference_filter.compose([3.0, -2.0, 2.0], p) for p in poses + drift])
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Scans in the southern corridor of the office."""
+    part = np.linspace(0.0, 1.0, SCANS)
+    poses = np.stack([1.0 + 2.0 * part, 0.9 + 0.0 * part, 0.3 * np.sin(6 * part)], axis=1)
+    walls = world.World(jnp.asarray(world.named("office").walls))
+    ranges = jax.vmap(lambda pose: lidar.cast(walls, pose, LIDAR).ranges)(jnp.asarray(poses))
+    times, wheels = 0.5 + np.arange(SCANS), wheels_of(poses)
+    ranges = np.where(np.arange(91) % 30 == 7, np.inf, np.asarray(ranges))
+    return Recording(times, wheels, ranges.astype(np.float32), LIDAR, 0, times, wheels), poses
+
+
+@pytest.fixture(scope="module")
+def scan_log(recording):
+    """The recording as a log, with a reference of some of its scans, on a clock not quite its."""
+    drive, poses = recording
+    some = np.array([FIRST, FIRST + 1, FIRST + 3])
+    extra = np.array([[9.0, 9.0, 9.0]])
+    times = np.append(drive.times[some] + [0.01, -0.02, 0.0], drive.times[1] + 0.4)
+    known = np.concatenate([poses[some], extra])
+    return logs.from_recording(drive, CONFIG, (times, known)), some
+
+
+CONFIG = Config(lidar=LIDAR, landmarks=12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sightings_are_the_features_of_a_slow_version(seed):
+    drive = sightings(seed)
+    log = logs.from_sightings(drive)
+    np.testing.assert_array_equal(log.known, drive.which)
+    np.testing.assert_array_equal(log.nodes.valid, drive.valid)
+    np.testing.assert_array_equal(log.judged, drive.referenced)
+    np.testing.assert_array_equal(log.truth, drive.truth)
+    np.testing.assert_array_equal(log.motion, drive.motion)
+    assert (log.nodes.kind == NODE).all()
+    for t, k in np.ndindex(drive.valid.shape):
+        xy, cov = np.zeros(2), np.zeros((2, 2))
+        if drive.valid[t, k]:
+            r, bearing = map(float, drive.polar[t, k])
+            xy = r * np.array([math.cos(bearing), math.sin(bearing)])
+            cov = (logs.PART * r) ** 2 * np.outer(xy / r, xy / r)
+        np.testing.assert_allclose(log.nodes.xy[t, k], xy, rtol=1e-12)
+        np.testing.assert_allclose(log.nodes.cov[t, k], cov, rtol=1e-12, atol=1e-18)
+
+
+def test_a_sighting_is_as_sure_as_a_part_of_its_range_and_sure_of_its_bearing():
+    drive = sightings(0)
+    log = logs.from_sightings(drive)
+    polar_cov = jax.vmap(sensor.polar_cov)(
+        jnp.asarray(log.nodes.xy[drive.valid]), jnp.asarray(log.nodes.cov[drive.valid])
+    )
+    expected = np.zeros(polar_cov.shape)
+    expected[:, 0, 0] = (logs.PART * drive.polar[drive.valid][:, 0].astype(float)) ** 2
+    np.testing.assert_allclose(polar_cov, expected, atol=1e-15)
+    assert expected.max() > 1e-4
+
+
+def test_logs_are_in_the_precision_of_jax():
+    for log in (logs.from_sightings(sightings(0)), logs.stack([logs.from_sightings(sightings(0))])):
+        leaves = jax.tree.leaves(log)
+        assert all(type(leaf) is np.ndarray for leaf in leaves)
+        assert {leaf.dtype.name for leaf in leaves} == {"float64", "int32", "bool"}
+    with jax.enable_x64(False):
+        leaves = jax.tree.leaves(logs.from_sightings(sightings(0)))
+    assert {leaf.dtype.name for leaf in leaves} == {"float32", "int32", "bool"}
+
+
+def test_a_recording_begins_at_its_first_reference(recording, scan_log):
+    (_, poses), (log, some) = recording, scan_log
+    assert {len(leaf) for leaf in jax.tree.leaves(log)} == {SCANS - FIRST} and log.known is None
+    judged = np.isin(np.arange(FIRST, SCANS), some)
+    np.testing.assert_array_equal(log.judged, judged)
+    np.testing.assert_array_equal(log.truth[judged], poses[some])
+    assert not log.truth[~judged].any() and judged[0]
+
+
+def test_motions_of_a_recording_lead_along_the_way_of_the_wheels(recording, scan_log):
+    wheels, log = recording[0].odometry[FIRST:], scan_log[0]
+    assert not log.motion[0].any() and (np.abs(log.motion[1:]).max(axis=1) > 0.1).all()
+    pose, chained = wheels[0], [wheels[0]]
+    for motion in log.motion[1:]:
+        pose = reference_filter.compose(pose, motion)
+        chained.append(pose)
+    off = np.array(chained) - wheels
+    np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.sin(off[:, 2] / 2), 0.0, atol=1e-12)
+
+
+def test_features_of_a_recording_are_those_of_each_scan(recording, scan_log):
+    ranges, log = recording[0].ranges, scan_log[0]
+    look = jax.jit(slam.front_end, static_argnums=0)
+    for t in range(SCANS - FIRST):
+        expected = look(CONFIG, lidar.limit(jnp.asarray(ranges[FIRST + t], float), LIDAR))
+        for a, b in zip(log.nodes, expected, strict=True):
+            np.testing.assert_allclose(a[t], b, rtol=1e-9, atol=1e-9)
+    assert (log.nodes.valid.sum(axis=1) >= 2).all()
+
+
+def test_a_recording_without_reference_begins_at_its_first_scan(recording, scan_log, monkeypatch):
+    whole = jax.tree.map(lambda x: np.zeros((SCANS, *x.shape[1:]), x.dtype), scan_log[0].nodes)
+    monkeypatch.setattr(logs, "look", lambda *_: whole)
+    log = logs.from_recording(recording[0], CONFIG)
+    assert len(log.truth) == len(log.motion) == SCANS
+    assert not log.truth.any() and not log.judged.any() and not log.motion[0].any()
+    np.testing.assert_allclose(log.motion[FIRST + 1 :], scan_log[0].motion[1:], atol=1e-12)
+
+
+@pytest.mark.parametrize("shift, count", [(1e6, SCANS), (0.25, SCANS), (0.0, 0)])
+def test_a_reference_of_another_time_is_none(recording, shift, count):
+    drive, poses = recording
+    known = drive.times[:count] + shift, poses[:count]
+    with pytest.raises(ValueError, match="no pose at the time of a scan"):
+        logs.from_recording(drive, CONFIG, known)
+
+
+@jax.jit
+def filtered(log):
+    """Info of a log of sightings, its three losses, and the gradient of their sum in the noise."""
+
+    def run(theta):
+        noise = jax.tree.map(jnp.exp, theta)
+        start = slam.init(SIGHTINGS, log.truth[0])
+        _, info = slam.run(SIGHTINGS, noise, start, Inputs(log.motion, log.nodes, log.known))
+        return jnp.stack([loss(info, log) for loss in LOSSES]), info
+
+    theta = jax.tree.map(jnp.log, slam.sighting_noise())
+    value, back, info = jax.vjp(run, theta, has_aux=True)
+    return info, value, back(jnp.ones(len(LOSSES)))[0]
+
+
+SIGHTINGS = Config(landmarks=4, matches=5, fresh=5, kinds=(NODE,))
+
+
+def take(logs, run):
+    return jax.tree.map(lambda x: x[run], logs)
+
+
+def check_same(short, long, steps):
+    """Info of a log and of the same log with padding."""
+    for name, a, b in zip(short._fields, short, long, strict=True):
+        b = b[:steps]
+        b = b[:, : a.shape[1]] if name in ("slot", "id", "used") else b
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Logs of sightings, one shorter and with fewer at a time; stacked."""
+    few, many = sightings(1, steps=6, most=2), sightings(2, steps=9, most=5)
+    few = few._replace(referenced=np.array([True, True, False, True, True, True]))
+    logs_ = [logs.from_sightings(one) for one in (few, many)]
+    return logs_, logs.stack(logs_)
+
+
+def test_padding_changes_nothing_of_a_drive(pair):
+    (short, long), both = pair
+    assert both.motion.shape == (2, 9, 3) and both.known.shape == (2, 9, 5)
+    info, value, slope = filtered(short)
+    padded, same_value, same_slope = filtered(take(both, 0))
+    check_same(info, padded, 6)
+    np.testing.assert_allclose(same_value, value, rtol=1e-9)
+    for a, b in zip(slope, same_slope, strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-7, atol=1e-12)
+    assert np.isfinite(value).all() and np.abs(slope.odometry).min() > 0.0
+    assert info.used.sum() >= 4 and not padded.used[6:].any() and not padded.dof[6:].any()
+    np.testing.assert_array_equal(padded.pose[6:], np.tile(padded.pose[5], (3, 1)))
+    np.testing.assert_array_equal(padded.pose_cov[6:], np.tile(padded.pose_cov[5], (3, 1, 1)))
+    for a, b in zip(jax.tree.leaves(long), jax.tree.leaves(take(both, 1)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_padding_changes_nothing_where_everything_is_judged(pair):
+    (short, long), _ = pair
+    both = logs.stack([short._replace(judged=None), long])
+    np.testing.assert_array_equal(both.judged[0], np.arange(9) < 6)
+    value = filtered(short._replace(judged=np.ones(6, bool)))[1]
+    np.testing.assert_allclose(filtered(take(both, 0))[1], value, rtol=1e-9)
+
+
+def test_padding_changes_nothing_of_scans(scan_log):
+    """A filter knows nothing of what comes: alone, the log has the info of a longer one."""
+    log, steps = scan_log[0], SCANS - FIRST
+    longer = jax.tree.map(lambda x: np.concatenate([x, x[::-1]]), log)
+    both = logs.stack([log, longer])
+
+    def run(one):
+        start, inputs = slam.init(CONFIG, one.truth[0]), Inputs(one.motion, one.nodes)
+        return slam.run(CONFIG, slam.log_noise(), start, inputs)[1]
+
+    info, padded = jax.tree.map(lambda x: x[:steps], run(longer)), run(take(both, 0))
+    check_same(info, padded, steps)
+    assert info.used.sum() > 4
+    for loss in LOSSES:
+        alone = float(loss(info, log))
+        assert alone != 0.0 and loss(padded, take(both, 0)) == pytest.approx(alone, rel=1e-9)
+
+
+def test_stacked_padding_is_blank(pair):
+    both = pair[1]
+    assert not both.judged[0, 6:].any() and not both.motion[0, 6:].any()
+    valid = both.nodes.valid[0]
+    assert not valid[6:].any() and not valid[:, 2:].any()
+    assert (both.known[0, 6:] == -1).all() and (both.known[0, :, 2:] == -1).all()
+
+
+def test_what_cannot_be_stacked(pair, scan_log):
+    with pytest.raises(ValueError, match="no logs"):
+        logs.stack([])
+    for mixed in ([pair[0][0], scan_log[0]], [scan_log[0], pair[0][0]]):
+        with pytest.raises(ValueError, match="know their landmarks"):
+            logs.stack(mixed)
+
+
+def test_a_filter_of_sightings_has_room_for_all():
+    drives = [sightings(0, most=2, landmarks=7), sightings(1, most=5, landmarks=6)]
+    config = logs.config_of(drives)
+    assert (config.landmarks, config.matches, config.fresh) == (7, 5, 5)
+    assert config.kinds == (NODE,)

@@ -36,13 +36,17 @@ def use_cores(cores: int | None = None) -> None:
         jax.config.update("jax_num_cpu_devices", jax.config.jax_num_cpu_devices)
     except RuntimeError:
         return
-    if cores is None:
-        own = getattr(os, "sched_getaffinity", None)
-        cores = len(own(0)) if own else os.cpu_count() or 1
+    cores = cores or cores_here()
     given = os.environ.get("XLA_FLAGS", "")
     more = [f"{flag}={value.format(cores=cores)}" for flag, value in FLAGS.items()]
     more = [flag for flag in more if flag.split("=")[0] not in given]
     os.environ["XLA_FLAGS"] = " ".join([*given.split(), *more])
+
+
+def cores_here() -> int:
+    """Number of cores that this process may use."""
+    own = getattr(os, "sched_getaffinity", None)
+    return len(own(0)) if own else os.cpu_count() or 1
 
 
 def map_batches(function: Callable, items: Any, *, size: int) -> Any:
@@ -125,7 +129,7 @@ class Spread:
             self._compiled.lower(*fixed, known, share[0])
             for known, share in zip(common, shares, strict=True)
         ]
-        with ThreadPoolExecutor(min(len(own), os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(min(len(own), cores_here())) as pool:
             programs = list(pool.map(lambda one: one.compile(), lowered))
         # One batch of every device after the other: none waits for the next.
         rounds = zip(*shares, strict=True)

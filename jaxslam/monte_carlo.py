@@ -243,13 +243,19 @@ def experiment(
         fixed = config, robot, steps, jax.random.key_impl(key)
         return _groups.begin(*fixed, setting, groups, devices=devices)
 
-    waiting = None
-    for start in [*range(first, runs, together), None]:
-        begun = None if start is None else (start, begin(start))
-        if waiting is not None:
-            number, finish = waiting
-            yield jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: runs - number], finish())
+    def end(start: int, finish: Callable[[], Track]) -> Track:
+        fold = lambda x: x.reshape(-1, *x.shape[2:])[max(0, first - start) : runs - start]
+        return jax.tree.map(fold, finish())
+
+    waiting = ()
+    # Groups begin at multiples of RUNS, wherever the first run is.
+    for start in range(first - first % RUNS, runs, together):
+        begun = start, begin(start)
+        if waiting:
+            yield end(*waiting)
         waiting = begun
+    if waiting:
+        yield end(*waiting)
 
 
 def evaluate(tracks: Track) -> dict:

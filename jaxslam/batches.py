@@ -31,11 +31,13 @@ def use_cores(cores: int | None = None) -> None:
     """
     if (jax.config.jax_platforms or "cpu").split(",")[0] != "cpu":
         return
+    devices = jax.config.jax_num_cpu_devices
     try:
-        # JAX refuses any new number of devices, even the same, once it has begun.
-        jax.config.update("jax_num_cpu_devices", jax.config.jax_num_cpu_devices)
+        # JAX refuses any other number once it has begun.
+        jax.config.update("jax_num_cpu_devices", max(0, devices) + 1)
     except RuntimeError:
         return
+    jax.config.update("jax_num_cpu_devices", devices)
     cores = cores or cores_here()
     given = os.environ.get("XLA_FLAGS", "")
     more = [f"{flag}={value.format(cores=cores)}" for flag, value in FLAGS.items()]

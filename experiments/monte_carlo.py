@@ -185,7 +185,7 @@ def load(folder: Path | None, mark: str) -> tuple[list[Track], float, float]:
         if first != sum(len(part.finite) for part in parts):
             break
         try:
-            with np.load(file, allow_pickle=False) as kept:
+            with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as kept:
                 other = str(kept["mark"])
                 part = Track(**{name: kept[name] for name in Track._fields})
                 seconds, most = float(kept["seconds"]), float(kept["peak_mb"])

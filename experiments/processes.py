@@ -46,7 +46,7 @@ def local(count: int) -> Group:
         return Group(f"{LOOPBACK}:{free.getsockname()[1]}", count, range(count))
 
 
-def run(group: Group, work: Callable, *given: Any, wait: float = WAIT) -> list[Any]:
+def run(group: Group, work: Callable, *given: Any) -> list[Any]:
     """Call `work(*given, say=...)` in every process; return what it returned in those of here.
 
     Args:
@@ -54,7 +54,6 @@ def run(group: Group, work: Callable, *given: Any, wait: float = WAIT) -> list[A
         work: A function of a module. It may write to the stream `say`; whatever else is printed
             goes to a file.
         given: Its arguments.
-        wait: Seconds in which all processes must have come up.
 
     Raises:
         Lost: One of them did not come up, or has ended early; the others are ended too.
@@ -70,7 +69,7 @@ def run(group: Group, work: Callable, *given: Any, wait: float = WAIT) -> list[A
         for number in group.own:
             here, there = spawn.Pipe(duplex=False)
             log = logs / f"{number}.txt"
-            arguments = (work, given, group, number, cores, wait, there, log)
+            arguments = (work, given, group, number, cores, WAIT, there, log)
             child = spawn.Process(target=_child, args=arguments)
             child.start()
             there.close()
@@ -78,7 +77,7 @@ def run(group: Group, work: Callable, *given: Any, wait: float = WAIT) -> list[A
     finally:
         _restore_interrupts(kept)
     try:
-        _follow(group, children, results, monotonic() + wait, logs)
+        _follow(group, children, results, monotonic() + WAIT, logs)
     finally:
         for child, _ in children.values():
             child.kill()
@@ -171,6 +170,7 @@ def _child(
         pipe.send(("up", None))
         result = work(*given, say=say)
         jax.distributed.shutdown()
+        say.close()
         pipe.send(("done", result))
     except InputError as error:
         _leave(pipe, ("refused", str(error)))

@@ -17,6 +17,7 @@ from tqdm import tqdm
 import jaxslam
 from jaxslam import lidar, metrics, monte_carlo, plan, report, skeleton, slam
 from jaxslam import world as worlds
+from jaxslam.batches import use_cores
 from jaxslam.io import carmen, graphml, occupancy, tum
 from jaxslam.io import noise as noise_file
 from jaxslam.io import relations as relations_file
@@ -76,6 +77,7 @@ def simulate(
         labels: What tells wall cells apart: straight runs, or the paper's edge codes.
         out: Folder for the results.
     """
+    use_cores()
     _within("--runs", runs, 1, 10**6)
     _within("--seed", seed, 0, 2**32 - 1)
     with _named("--world"):

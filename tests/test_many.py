@@ -82,9 +82,12 @@ def left_over(pid):
 
 
 @pytest.mark.timeout(300)
-def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path):
+def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
+    flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
+    monkeypatch.setenv("XLA_FLAGS", flags)
     numbers = monte_carlo.compute(CASE, RUNS, tmp_path / "runs", processes.local(2))
-    assert numbers["processes"] == 2
+    assert numbers["processes"] == numbers["devices"] == 2
     assert told(numbers) == told(done[0])
     (one,), (two,) = ([*folder.glob("*.npz")] for folder in (done[1], tmp_path / "runs"))
     with np.load(one) as one, np.load(two) as two:

@@ -58,7 +58,8 @@ def compute(seed: int, devices: int) -> Numbers:
         devices: On which numbers of runs, scans and landmarks are tried.
     """
     usual = {"seed": seed, "runs": RUNS, "steps": STEPS, "landmarks": LANDMARKS}
-    with tempfile.TemporaryDirectory() as kept:
+    with tempfile.TemporaryDirectory() as temporary:
+        kept = jax.config.jax_compilation_cache_dir or temporary
 
         def measure(count: int, **other: int) -> Numbers:
             given = usual | other | {"pinned": count == 1}

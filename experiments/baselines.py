@@ -11,6 +11,7 @@ import jax
 
 from experiments import common
 from jaxslam import monte_carlo, slam
+from jaxslam.batches import use_cores
 from jaxslam.motion import Robot
 from jaxslam.types import NODE
 
@@ -55,6 +56,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the experiment, and print its table."""
     given = common.parse(__doc__, argv, runs=100)
+    use_cores()
     numbers = compute(given.seed, given.runs)
     common.save(given.out, "baselines", numbers, draw)
     print(f"{'':16}position  heading   NEES  diverged")

@@ -268,20 +268,28 @@ def others(seed: int) -> Numbers:
 TASKS = {"memory": memory, "devices": devices, "precision": precision, "others": others}
 
 
-def apart(task: str, kept: str, *, devices: int = 1, **arguments: Any) -> Numbers:
+def apart(
+    task: str,
+    kept: str,
+    *,
+    devices: int = 1,
+    module: str = "experiments.estimator",
+    **arguments: Any,
+) -> Numbers:
     """Figures of a task in a process of its own, or a note why there are none.
 
     Args:
         task: One of `TASKS`.
         kept: Folder for what is compiled.
         devices: That JAX is to see there.
+        module: That has the task.
         arguments: Of the task.
     """
     flags = [f for f in os.environ.get("XLA_FLAGS", "").split() if not f.startswith(DEVICES)]
     whole = [WHOLE] if devices > 1 else []
     own = os.environ | {"XLA_FLAGS": " ".join([*flags, f"{DEVICES}={devices}", *whole])}
     own |= {"JAX_ENABLE_X64": "0", "JAX_COMPILATION_CACHE_DIR": kept}
-    command = [sys.executable, "-m", "experiments.estimator", task, json.dumps(arguments)]
+    command = [sys.executable, "-m", module, task, json.dumps(arguments)]
     run = partial(subprocess.run, cwd=ROOT, capture_output=True, text=True)
     try:
         done = run(command, env=own, timeout=LIMIT)

@@ -8,6 +8,7 @@ import numpy as np
 
 from experiments import common
 from jaxslam import metrics, monte_carlo, slam
+from jaxslam.batches import use_cores
 from jaxslam.motion import Robot
 
 SHOWN = 20  # runs drawn one by one
@@ -61,6 +62,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
     given = common.parse(__doc__, argv, runs=100)
+    use_cores()
     numbers = compute(given.seed, given.runs)
     common.save(given.out, "fig13_errors", numbers, draw)
     print({key: numbers[key] for key in ("position_rmse_m", "heading_rmse_deg", "nees")})

@@ -1,6 +1,8 @@
 """Many of the same thing: a few at a time on each device, on all devices of all processes."""
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -12,6 +14,41 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxslam.types import Array
+
+FLAGS = {"--xla_force_host_platform_device_count": "{cores}"}
+# By default XLA splits operations among the threads of all devices, and these are short.
+FLAGS["--xla_disable_hlo_passes"] = "cpu-parallel-task-assigner"
+
+
+def use_cores(cores: int | None = None) -> None:
+    """Give JAX a device for each core of a CPU, which it leaves operations to as a whole.
+
+    To be called before JAX does its first work: afterwards, or where JAX was told to use something
+    else than the CPU, it does nothing. What the user has set in XLA_FLAGS stays.
+
+    Args:
+        cores: How many; by default all that this process may use.
+    """
+    if (jax.config.jax_platforms or "cpu").split(",")[0] != "cpu":
+        return
+    devices = jax.config.jax_num_cpu_devices
+    try:
+        # JAX refuses any other number once it has begun.
+        jax.config.update("jax_num_cpu_devices", max(0, devices) + 1)
+    except RuntimeError:
+        return
+    jax.config.update("jax_num_cpu_devices", devices)
+    cores = cores or cores_here()
+    given = os.environ.get("XLA_FLAGS", "")
+    more = [f"{flag}={value.format(cores=cores)}" for flag, value in FLAGS.items()]
+    more = [flag for flag in more if flag.split("=")[0] not in given]
+    os.environ["XLA_FLAGS"] = " ".join([*given.split(), *more])
+
+
+def cores_here() -> int:
+    """Number of cores that this process may use."""
+    own = getattr(os, "sched_getaffinity", None)
+    return len(own(0)) if own else os.cpu_count() or 1
 
 
 def map_batches(function: Callable, items: Any, *, size: int) -> Any:
@@ -42,13 +79,14 @@ def pad(items: Any, *, to: int) -> Any:
 
 
 class Spread:
-    """A function of one item, compiled once, for any number of them on all devices.
+    """A function of one item, compiled for `size` of them, for any number on all devices.
 
-    Each device takes `size` items at a time, vectorised, so that the result of an item depends
-    neither on the other items nor on the number of devices or processes, bit for bit where the
-    devices are alike (fewer items than fill the devices are vectorised more narrowly, and may
-    differ by rounding). All processes must call it with the same arguments, and all get the whole
-    result.
+    Each device has a program of its own, the same for all, and takes `size` items at a time,
+    vectorised: the result of an item depends neither on the other items nor on the number of
+    devices or processes, bit for bit where the devices are alike. (XLA compiles a program for two
+    devices to other roundings than one for one device.) Fewer items than fill the devices are
+    vectorised more narrowly, and may differ by rounding. All processes must call it with the same
+    arguments, and all get the whole result.
     """
 
     def __init__(self, function: Callable, *, size: int, static: int = 0):
@@ -56,12 +94,12 @@ class Spread:
 
         Args:
             function: Of `static` hashable arguments, one record common to all, and one item.
-            size: Items that a device works on together.
+            size: Items that a device works on together; one alone is not vectorised.
             static: Number of leading arguments that are static under jit.
         """
         self.size = size
         self._function = function
-        self._compiled = jax.jit(self._run, static_argnums=tuple(range(static + 2)))
+        self._compiled = jax.jit(self._run, static_argnums=tuple(range(static)))
 
     def __call__(self, *given: Any, devices: Sequence[jax.Device] | None = None) -> Any:
         """Results of the function, as NumPy arrays that lead with the number of items.
@@ -69,36 +107,68 @@ class Spread:
         Args:
             given: The static arguments, the common record, and the items, arrays that lead with
                 their number.
-            devices: To be used; all by default.
+            devices: To be used, as many of each process; all by default.
         """
+        return self.begin(*given, devices=devices)()
+
+    def begin(self, *given: Any, devices: Sequence[jax.Device] | None = None) -> Callable[[], Any]:
+        """Start the work, with the arguments of a call, and return what waits for its results."""
         *fixed, common, items = given
         mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("items",))
         count = jax.tree.leaves(items)[0].shape[0]
         size = min(self.size, -(-count // mesh.size))
-        items = pad(items, to=count + -count % (size * mesh.size))
-        common = jax.tree.map(partial(_place, mesh, PartitionSpec()), common)
-        items = jax.tree.map(partial(_place, mesh, PartitionSpec("items")), items)
-        result = self._compiled(mesh, size, *fixed, common, items)
-        if jax.process_count() > 1:
-            result = multihost_utils.process_allgather(result, tiled=True)
-        return jax.tree.map(lambda x: np.asarray(x)[:count], result)
+        each = -(-count // (size * mesh.size))  # batches of a device
+        items = pad(items, to=each * size * mesh.size)
+        own = [(k, d) for k, d in enumerate(mesh.devices) if d in mesh.local_devices]
+        common = [jax.device_put(common, device) for _, device in own]
 
-    def _run(self, mesh: Mesh, size: int, *given: Any) -> Any:
+        def batch(place: int, number: int, device: jax.Device) -> Any:
+            first = (place * each + number) * size
+            return jax.device_put(jax.tree.map(lambda x: x[first : first + size], items), device)
+
+        shares = [[batch(k, number, device) for number in range(each)] for k, device in own]
+        lowered = [
+            self._compiled.lower(*fixed, known, share[0])
+            for known, share in zip(common, shares, strict=True)
+        ]
+        with ThreadPoolExecutor(min(len(own), cores_here())) as pool:
+            programs = list(pool.map(lambda one: one.compile(), lowered))
+        # One batch of every device after the other: none waits for the next.
+        rounds = zip(*shares, strict=True)
+        ready = [
+            [program(known, one) for program, known, one in zip(programs, common, now, strict=True)]
+            for now in rounds
+        ]
+
+        def finish() -> Any:
+            whole = [_gather(mesh, parts) for parts in ready]
+
+            def join(*rounds: np.ndarray) -> np.ndarray:
+                x = np.stack([x.reshape(mesh.size, size, *x.shape[1:]) for x in rounds], axis=1)
+                return x.reshape(-1, *x.shape[3:])[:count]
+
+            return jax.tree.map(join, *whole)
+
+        return finish
+
+    def _run(self, *given: Any) -> Any:
         *fixed, common, items = given
-
-        def share(common: Any, items: Any) -> Any:
-            return map_batches(partial(self._function, *fixed, common), items, size=size)
-
-        # Nothing passes between the devices: there is nothing to check of what varies among them.
-        along = PartitionSpec("items")
-        specs = {"in_specs": (PartitionSpec(), along), "out_specs": along, "check_vma": False}
-        return jax.shard_map(share, mesh=mesh, **specs)(common, items)
+        function = partial(self._function, *fixed, common)
+        if jax.tree.leaves(items)[0].shape[0] > 1:
+            return jax.vmap(function)(items)
+        one = function(jax.tree.map(lambda x: x[0], items))
+        return jax.tree.map(lambda x: x[None], one)
 
 
-def _place(mesh: Mesh, spec: PartitionSpec, x: Array | np.ndarray) -> Array:
-    """An array on the devices of a mesh, those of other processes among them."""
-    sharding = NamedSharding(mesh, spec)
-    if jax.process_count() == 1:
-        return jax.device_put(x, sharding)
-    x = np.asarray(x)
-    return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
+def _gather(mesh: Mesh, parts: list[Any]) -> Any:
+    """What each device of a mesh has of a result, together, on all processes as NumPy arrays."""
+
+    def whole(*parts: Array) -> Array:
+        sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
+        shape = (mesh.size * len(parts[0]), *parts[0].shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, sharding, parts)
+
+    result = jax.tree.map(whole, *parts)
+    if jax.process_count() > 1:
+        return multihost_utils.process_allgather(result, tiled=True)
+    return jax.tree.map(np.asarray, result)

@@ -3,11 +3,9 @@
 The only module, beside `fit`, in which arrays lead with B, the runs.
 """
 
-import os
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +13,7 @@ import numpy as np
 from jax import lax
 
 from jaxslam import lidar, motion, plan, slam
-from jaxslam.batches import map_batches
+from jaxslam.batches import Spread, map_batches
 from jaxslam.geometry import compose
 from jaxslam.lidar import Scan
 from jaxslam.metrics import nees, pose_error
@@ -185,10 +183,25 @@ def tracks(config: Config, noise: Noise, logs: Log) -> Track:
     return map_batches(partial(track, config, noise), logs, size=RUNS)
 
 
-@partial(jax.jit, static_argnames=("config", "robot", "steps"))
-def _experiment(keys, config, noise, world, robot, path, *, steps) -> Track:
-    logs = simulate_keys(keys, config, world, robot, path, steps=steps)
-    return tracks(config, noise, logs)
+class _Setting(NamedTuple):
+    """What all runs of an experiment have in common."""
+
+    key: Array  # the data of a key, which NumPy can hold
+    noise: Noise
+    world: World
+    path: Array  # (N, 2)
+
+
+def _group(
+    config: Config, robot: Robot, steps: int, kind: Any, setting: _Setting, numbers: Array
+) -> Track:
+    """Simulate the runs with a few numbers (RUNS,) one by one, and filter them together."""
+    keys = run_keys(jax.random.wrap_key_data(setting.key, impl=kind), numbers)
+    logs = simulate_keys(keys, config, setting.world, robot, setting.path, steps=steps)
+    return tracks(config, setting.noise, logs)
+
+
+_groups = Spread(_group, size=1, static=4)
 
 
 def experiment(
@@ -201,11 +214,15 @@ def experiment(
     *,
     runs: int,
     steps: int,
-    threads: int | None = None,
+    first: int = 0,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[Track]:
-    """Simulate and filter runs 0 to B - 1; yield their tracks a few runs at a time, in order.
+    """Simulate and filter runs `first` to B - 1; yield their tracks a few at a time, in order.
 
-    Memory is bounded by the few runs under way. What is yielded holds NumPy arrays.
+    Each device does RUNS of them at a time. What becomes of a run depends neither on how many
+    there are nor on where it runs, bit for bit where devices are alike. Memory is bounded by the
+    runs under way: those of a next call begin before those of the last are handed out. With
+    several processes all must call it alike, and all get all tracks, which hold NumPy arrays.
 
     Args:
         key: Key of the experiment; run i has `run_keys(key, i)`.
@@ -216,26 +233,42 @@ def experiment(
         path: (N, 2) way of the robot.
         runs: B.
         steps: Scans of a run.
-        threads: Groups of runs under way together; all cores by default.
+        first: Number of the first run; those before it were done by another call.
+        devices: To be used; all, of all processes, by default.
     """
+    devices = jax.devices() if devices is None else devices
+    setting = _Setting(jax.random.key_data(key), noise, world, path)
+    together = RUNS * len(devices)
 
-    def group(first: int) -> Track:
-        # A last, smaller group repeats its last run, so that nothing is compiled again.
-        numbers = jnp.minimum(first + jnp.arange(RUNS), runs - 1)
-        keys = run_keys(key, numbers)
-        done = _experiment(keys, config, noise, world, robot, path, steps=steps)
-        return jax.tree.map(lambda x: np.asarray(x)[: runs - first], done)
+    def begin(start: int) -> Callable[[], Track]:
+        # What is missing in a last call repeats the last run, so that nothing is compiled again.
+        numbers = np.minimum(start + np.arange(together, dtype=np.int32), runs - 1)
+        groups = numbers.reshape(-1, RUNS)
+        fixed = config, robot, steps, jax.random.key_impl(key)
+        return _groups.begin(*fixed, setting, groups, devices=devices)
 
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        yield group(0)  # alone, so that it is compiled once
-        yield from pool.map(group, range(RUNS, runs, RUNS))
+    def end(start: int, finish: Callable[[], Track]) -> Track:
+        fold = lambda x: x.reshape(-1, *x.shape[2:])[max(0, first - start) : runs - start]
+        return jax.tree.map(fold, finish())
+
+    waiting = ()
+    # Groups begin at multiples of RUNS, wherever the first run is.
+    for start in range(first - first % RUNS, runs, together):
+        begun = start, begin(start)
+        if waiting:
+            yield end(*waiting)
+        waiting = begun
+    if waiting:
+        yield end(*waiting)
 
 
 def evaluate(tracks: Track) -> dict:
     """Errors over all steps whose truth is known, with the keys of `metrics.json`.
 
     A run has diverged when its final position error exceeds 1 m or is no number; runs with
-    numbers that are none are counted there and left out of the means.
+    numbers that are none are counted there, and apart, and left out of the means. Each is listed
+    with its number, and `run_keys` of the experiment's key and that number is its own key: with it
+    `replay` does the run alone.
     """
     tracks = jax.tree.map(np.asarray, tracks)
     good = tracks.finite & np.all(np.isfinite(tracks.estimate), axis=(1, 2))
@@ -255,6 +288,8 @@ def evaluate(tracks: Track) -> dict:
         "nees": float(np.mean(ratio[use]) / 3) if use.any() else None,
         "diverged": len(diverged),
         "diverged_runs": diverged.tolist(),
+        "nonfinite": int(np.sum(~good)),
+        "nonfinite_runs": np.flatnonzero(~good).tolist(),
         "landmarks": float(np.mean(tracks.landmarks)),
         "matches": float(np.mean(tracks.matches)),
         "dead_reckoning": errors(blind[judged])

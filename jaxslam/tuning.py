@@ -17,6 +17,7 @@ from tqdm import tqdm
 from jaxslam import curvature, fit, losses, metrics, monte_carlo, plan, report, slam
 from jaxslam import logs as log_of
 from jaxslam import world as worlds
+from jaxslam.batches import use_cores
 from jaxslam.io import carmen, checkpoint, mrclam, tum
 from jaxslam.io import noise as noise_file
 from jaxslam.io.errors import InputError
@@ -92,6 +93,7 @@ def tune(
         seed: Of the simulated drives and of the order of batches.
         out: Folder for the results.
     """
+    use_cores()
     within("--steps", steps, 1, 10**5)
     within("--seed", seed, 0, 2**32 - 1)
     within("--batch", 1 if batch is None else batch, 1, 10**6)

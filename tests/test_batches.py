@@ -1,3 +1,8 @@
+import os
+import subprocess
+import sys
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +57,49 @@ def test_bits_do_not_depend_on_the_number_of_items_or_devices():
     many = spread(2, common, items(19))
     few = spread(2, common, items(9), devices=jax.devices()[:1])
     assert_same(jax.tree.map(lambda x: x[:9], many), few)
+
+
+def test_what_is_one_at_a_time_is_not_vectorised():
+    """A decision of one item stays one: of a batch, both sides would be done."""
+    decide = lambda common, item: jax.lax.cond(item > 0, lambda: common, lambda: -common)
+    for size, word in [(1, "cond"), (2, "select")]:
+        spread = Spread(decide, size=size)
+        run = spread._compiled.trace(jnp.float64(1.0), jnp.arange(size)).jaxpr
+        assert word in str(run)
+    assert Spread(decide, size=1)(jnp.float64(2.0), jnp.array([1, 0, 3])).tolist() == [2, -2, 2]
+
+
+def test_work_is_begun_before_it_is_waited_for():
+    spread = Spread(scaled, size=2, static=1)
+    common = {"by": jnp.float64(1.7)}
+    finish = [spread.begin(2, common, items(count)) for count in (3, 7)]
+    for one, count in zip(finish, (3, 7), strict=True):
+        assert_same(one(), spread(2, common, items(count)))
+
+
+USE = "import os, jax; from jaxslam import batches; batches.use_cores({}); "
+TELL = "print(jax.device_count(), os.environ.get('XLA_FLAGS', ''))"
+
+
+def told(code, **own):
+    keep = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    run = partial(subprocess.run, capture_output=True, text=True, timeout=60, check=True)
+    return run([sys.executable, "-c", code], env=keep | own).stdout.split()
+
+
+@pytest.mark.timeout(120)
+def test_every_core_is_a_device_unless_told_otherwise():
+    whole = "--xla_disable_hlo_passes=cpu-parallel-task-assigner"
+    three = "--xla_force_host_platform_device_count=3"
+    assert told(USE.format(3) + TELL) == ["3", three, whole]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    assert told(USE.format("") + TELL)[0] == str(cores)
+    # What the user says holds, and what is up stays.
+    assert told(USE.format(2) + TELL, XLA_FLAGS=three) == ["3", three, whole]
+    assert told("import jax; jax.devices(); " + USE.format(3) + TELL) == ["1"]
+    assert told(USE.format(3) + "print(os.environ.get('XLA_FLAGS', '-'))", JAX_PLATFORMS="tpu") == [
+        "-"
+    ]
 
 
 def test_spread_is_traced_once_for_each_number_of_batches():

@@ -275,6 +275,11 @@ def test_wrong_usage_exits_2(arguments, capsys):
     assert capsys.readouterr().err
 
 
+def test_what_is_compiled_side_by_side_counts_once():
+    assert cli._covered([]) == 0.0
+    assert cli._covered([(5.0, 6.0), (0.0, 2.0), (1.0, 3.0), (1.5, 2.5)]) == 4.0
+
+
 @pytest.mark.parametrize("arguments", [[], ["--help"]])
 def test_help_lists_the_commands(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:

@@ -22,38 +22,52 @@ KEY = jax.random.key(5)
 PATH = plan.densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)]))
 
 
-def experiment(runs, threads):
-    parts = monte_carlo.experiment(
-        KEY,
-        CONFIG,
-        slam.wheel_noise(ROBOT),
-        world.World(jnp.asarray(world.named("fig07").walls)),
-        ROBOT,
-        jnp.asarray(PATH),
-        runs=runs,
-        steps=STEPS,
-        threads=threads,
+SETTING = (
+    CONFIG,
+    slam.wheel_noise(ROBOT),
+    world.World(jnp.asarray(world.named("fig07").walls)),
+    ROBOT,
+    jnp.asarray(PATH),
+)
+
+
+def experiment(runs, devices, key=KEY, first=0):
+    own = jax.devices()[:devices]
+    return list(
+        monte_carlo.experiment(key, *SETTING, runs=runs, steps=STEPS, first=first, devices=own)
     )
-    return list(parts)
 
 
 @pytest.fixture(scope="module")
 def nine():
-    return experiment(9, threads=2)
+    return experiment(9, devices=2)
 
 
 def assert_same(one, two):
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
-def test_runs_do_not_depend_on_their_number_nor_on_threads(nine):
-    many, few = monte_carlo.collect(nine), monte_carlo.collect(experiment(6, threads=1))
+def test_runs_depend_neither_on_their_number_nor_on_the_devices(nine):
+    many, few = monte_carlo.collect(nine), monte_carlo.collect(experiment(6, devices=1))
     assert_same(jax.tree.map(lambda x: x[:6], many), few)
     assert len(np.unique(many.truth[:, -1, 0])) == 9
+    assert all(isinstance(x, np.ndarray) for x in many)
+
+
+@pytest.mark.parametrize("first, runs, sizes", [(0, 9, [4, 4, 1]), (3, 6, [1, 2]), (6, 7, [1])])
+def test_an_experiment_goes_on_where_another_ended(nine, first, runs, sizes):
+    rest = experiment(runs, devices=1, first=first)
+    assert [len(part.truth) for part in rest] == sizes
+    whole = jax.tree.map(lambda x: x[first:runs], monte_carlo.collect(nine))
+    assert_same(monte_carlo.collect(rest), whole)
+
+
+def test_there_is_nothing_after_the_last_run():
+    assert experiment(8, devices=2, first=8) == []
 
 
 def test_experiment_yields_the_runs_in_order(nine):
-    assert [len(part.truth) for part in nine] == [4, 4, 1]
+    assert [len(part.truth) for part in nine] == [8, 1]
     keys = jax.vmap(lambda k: jax.random.split(k)[0])(
         jnp.stack([jax.random.fold_in(KEY, i) for i in range(9)])
     )
@@ -143,6 +157,7 @@ def test_evaluate_counts_diverged_and_nonfinite_runs_and_masks_the_latter():
     summary = monte_carlo.evaluate(jax.tree.map(lambda *x: np.stack(x), *runs))
     good = np.array([0.2, 1.5, -0.4])
     assert summary["runs"] == 5 and summary["diverged_runs"] == [1, 2, 3]
+    assert summary["nonfinite_runs"] == [2, 3] and summary["nonfinite"] == 2
     assert summary["diverged"] == 3 and summary["dead_reckoning"]["diverged"] == 1
     assert summary["position_rmse_m"] == pytest.approx(np.sqrt(np.mean(good**2) / 2))
     assert summary["heading_rmse_deg"] == 0

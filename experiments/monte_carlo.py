@@ -1,0 +1,360 @@
+"""How large the errors of many drives are, and what many drives cost in time and memory.
+
+The robot drives from S to F through the office, again and again with new noise. `p50_m`, `p95_m`
+and `p99_m` are percentiles over the runs of each run's position RMSE: one drive of a hundred is
+worse than `p99_m`. Runs that end more than 1 m off, or in no number, are counted apart with their
+numbers; with `--replay RUN` one is driven alone.
+
+The same command goes on where it was stopped: what is done is kept in the folder `--out`. With
+`--processes 2` two processes of this machine share the work; on several machines, start one on
+each with `--coordinator_address HOST:PORT --num_processes N --process_id K`. The results are the
+same bit for bit.
+"""
+
+import hashlib
+import os
+import shutil
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple, TextIO
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from tqdm import tqdm
+
+import jaxslam
+from experiments import common, processes, scaling
+from experiments.estimator import peak
+from jaxslam import metrics, monte_carlo, plan, slam, world
+from jaxslam.batches import use_cores
+from jaxslam.io.errors import InputError
+from jaxslam.monte_carlo import Track
+from jaxslam.motion import Robot
+
+NAME = "monte_carlo"
+KEPT = 64  # runs of a file of those that are done
+WORST = 5  # runs drawn one by one
+SHOWN = (50, 95, 99)  # percentiles
+BINS = 60
+ROOM = 30.0  # the worst run's error is drawn this many times as large, unless it has diverged
+
+
+class Case(NamedTuple):
+    """What is driven, in what and how."""
+
+    seed: int
+    config: slam.Config
+    robot: Robot
+    walls: np.ndarray  # (S, 4)
+    path: np.ndarray  # (N, 2)
+    steps: int | None = None  # scans of a run; those to the end of the path by default
+
+
+def office(seed: int) -> Case:
+    """The drive from S to F."""
+    path = plan.densify(world.drive("office"))
+    return Case(seed, slam.Config(), Robot(), np.asarray(world.named("office").walls), path)
+
+
+def work(case: Case, runs: int, folder: Path | None, say: TextIO | None = None) -> common.Numbers:
+    """Errors of B runs; called in all processes, and process 0 keeps what is done.
+
+    Args:
+        case: What is driven.
+        runs: B.
+        folder: For what is done, so that a next call goes on; None to keep nothing.
+        say: Stream of the progress bar.
+    """
+    key, robot = jax.random.key(case.seed), case.robot
+    place, path = world.World(jnp.asarray(case.walls, float)), jnp.asarray(case.path, float)
+    steps = case.steps or monte_carlo.drive_steps(robot, path)
+    noise = slam.wheel_noise(robot)
+    given = key, case.config, noise, place, robot, path
+    leads = jax.process_index() == 0
+    folder = folder if leads else None
+    mark = fingerprint(case._replace(steps=steps), noise)
+    done, seconds, most = load(folder, mark)
+    first = sum(len(part.finite) for part in done)
+    if jax.process_count() > 1:
+        first = int(multihost_utils.broadcast_one_to_all(np.int32(first)))
+    with tqdm(total=runs, initial=min(first, runs), unit="run", file=say, desc="compiling") as bar:
+        if first < runs:  # compiles, which is not timed
+            next(monte_carlo.experiment(*given, runs=first + 1, steps=steps, first=first))
+        bar.set_description("running")
+        bar.unpause()
+        begin, new = perf_counter(), []
+        for part in monte_carlo.experiment(*given, runs=runs, steps=steps, first=first):
+            bar.update(len(part.finite))
+            first += len(part.finite)
+            if not leads:
+                continue
+            new.append(part)
+            if sum(len(one.finite) for one in new) >= KEPT or first == runs:
+                done.append(monte_carlo.collect(new))
+                now, new = perf_counter(), []
+                seconds, begin = seconds + now - begin, now
+                most = max(most, peak())
+                keep(folder, first, done[-1], mark, seconds, most)
+    if not leads:
+        return {"peak_mb": peak()}
+    tracks = jax.tree.map(lambda x: x[:runs], monte_carlo.collect(done))
+    numbers = {
+        "seed": case.seed,
+        "steps": steps,
+        "seconds": seconds,
+        "seconds_per_scan": seconds / tracks.matches.size,
+        "devices": jax.device_count(),
+        "processes": jax.process_count(),
+        **summary(key, tracks),
+    }
+    return numbers | {"walls": case.walls, "peak_mb": max(most, peak())}
+
+
+def summary(key: Any, tracks: Track) -> common.Numbers:
+    """Distribution of the errors of B runs, and the worst of them."""
+    error = np.asarray(metrics.pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth)))
+    off = np.linalg.norm(error[..., :2], axis=-1)  # (B, T)
+    told = monte_carlo.evaluate(tracks)
+    good = np.setdiff1d(np.arange(len(off)), told["nonfinite_runs"])
+    rmse = np.sqrt(np.mean(off**2, axis=1))
+    if good.size == 0:
+        return told | {f"p{k}_m": None for k in SHOWN} | {"worst": []}
+    worst = good[np.argsort(rmse[good], kind="stable")[::-1][:WORST]]
+    keys = jax.random.key_data(monte_carlo.run_keys(key, jnp.asarray(worst, jnp.int32)))
+    low, high = rmse[good].min(), rmse[good].max()
+    edges = np.geomspace(0.99 * low + 1e-9, 1.01 * high + 1e-9, BINS + 1)
+    return {
+        **told,
+        **{f"p{k}_m": np.percentile(rmse[good], k) for k in SHOWN},
+        "largest_m": off[good].max(),
+        "histogram": {"edges_m": edges, "runs": np.histogram(rmse[good], edges)[0]},
+        "per_scan": {f"p{k}_m": np.percentile(off[good], k, axis=0) for k in SHOWN},
+        "worst": [
+            {
+                "run": int(run),
+                "key": own,
+                "position_rmse_m": rmse[run],
+                "error_m": off[run],
+                "truth": tracks.truth[run, :, :2],
+                "estimate": tracks.estimate[run, :, :2],
+            }
+            for run, own in zip(worst, np.asarray(keys), strict=True)
+        ],
+    }
+
+
+def fingerprint(case: Case, noise: slam.Noise) -> str:
+    """What must be the same for runs to be of one experiment: the case and the program."""
+    text = hashlib.sha256(repr((case._replace(walls=0, path=0), jax.__version__)).encode())
+    for x in (case.walls, case.path, *jax.tree.leaves(noise)):
+        text.update(np.asarray(x, float).tobytes())
+    for file in sorted(Path(jaxslam.__file__).parent.rglob("*.py")):
+        text.update(file.read_bytes())
+    return f"{case.seed}, {text.hexdigest()[:16]}"
+
+
+def keep(
+    folder: Path | None, end: int, part: Track, mark: str, seconds: float, most: float
+) -> None:
+    """Write the runs before number `end` to a file, which appears whole or not at all."""
+    if folder is None:
+        return
+    file = folder / f"{end - len(part.finite):07d}.npz"
+    temporary = folder / f".{os.getpid()}.tmp"
+    told = {"mark": np.array(mark), "seconds": np.array(seconds), "peak_mb": np.array(most)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as stream:
+            np.savez(stream, **part._asdict(), **told)
+        os.replace(temporary, file)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", path=file) from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(folder: Path | None, mark: str) -> tuple[list[Track], float, float]:
+    """Runs that were kept, from number 0 without a gap; their seconds and memory [MB]."""
+    parts, seconds, most = [], 0.0, 0.0
+    for first, file in _files(folder):
+        if first != sum(len(part.finite) for part in parts):
+            break
+        try:
+            with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as kept:
+                other = str(kept["mark"])
+                part = Track(**{name: kept[name] for name in Track._fields})
+                seconds, most = float(kept["seconds"]), float(kept["peak_mb"])
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+            raise InputError("is broken", path=file, advice="remove it") from None
+        if other != mark:
+            advice = f"finish those, or remove {folder}"
+            raise InputError("has runs of another seed or program", path=file, advice=advice)
+        parts.append(part)
+    return parts, seconds, most
+
+
+def _files(folder: Path | None) -> Iterator[tuple[int, Path]]:
+    """Number of the first run and file of all that is kept, in order."""
+    for file in sorted([] if folder is None else folder.glob("*.npz")):
+        yield int(file.stem), file
+
+
+def draw(numbers: common.Numbers, path: Path) -> None:
+    """Distribution of the errors, errors on the way, the worst run, time and memory."""
+    figure, axes = common.canvas(12, 11, 3, 2)
+    _draw_distribution(axes[0, 0], numbers)
+    _draw_worst(axes[0, 1], numbers)
+    _draw_way(axes[1, 0], numbers)
+    _draw_devices(axes[1, 1], numbers["scaling"])
+    for axis, key, label in zip(
+        axes[2], ("ms_per_scan", "peak_mb"), ("ms per scan", "peak memory [MB]"), strict=True
+    ):
+        _draw_scaling(axis, numbers["scaling"], key, label)
+    figure.savefig(path)
+
+
+def _draw_distribution(axis: Any, numbers: common.Numbers) -> None:
+    if not numbers["worst"]:
+        return
+    edges = np.array(numbers["histogram"]["edges_m"])
+    axis.stairs(numbers["histogram"]["runs"], edges, fill=True, color=common.SKY)
+    for k, style in zip(SHOWN, ("-", "--", ":"), strict=True):
+        value = numbers[f"p{k}_m"]
+        label = f"{k} % below {100 * value:.2f} cm"
+        axis.axvline(value, color=common.BLACK, linestyle=style, label=label)
+    axis.set(xscale="log", xlabel="position RMSE of a run [m]", ylabel="runs")
+    title = f"{numbers['runs']} runs, {numbers['diverged']} diverged"
+    axis.set_title(f"{title}, {numbers['nonfinite']} in no number")
+    axis.legend()
+
+
+def _draw_worst(axis: Any, numbers: common.Numbers) -> None:
+    if not numbers["worst"]:
+        return
+    for k, style in zip(SHOWN, ("-", "--", ":"), strict=True):
+        shown = numbers["per_scan"][f"p{k}_m"]
+        axis.plot(shown, color=common.BLACK, linestyle=style, label=f"{k} % of runs below")
+    colours = (common.RED, common.ORANGE, common.GREEN, common.BLUE, common.PINK)
+    for one, colour in zip(numbers["worst"], colours, strict=False):
+        axis.plot(one["error_m"], color=colour, linewidth=0.8, label=f"run {one['run']}")
+    axis.set(xlabel="scan", ylabel="position error [m]", yscale="log", ylim=(1e-4, None))
+    axis.set_title("the worst runs")
+    axis.legend(ncols=2, fontsize="small")
+
+
+def _draw_way(axis: Any, numbers: common.Numbers) -> None:
+    for x1, y1, x2, y2 in numbers["walls"]:
+        axis.plot([x1, x2], [y1, y2], color=common.BLACK, linewidth=1)
+    for one in numbers["worst"][:1]:
+        truth, estimate = np.array(one["truth"]), np.array(one["estimate"])
+        larger = ROOM if max(one["error_m"]) < 1.0 / ROOM else 1.0
+        shown = truth + larger * (estimate - truth)
+        axis.plot(*truth.T, color=common.GREEN, linestyle="--", label="true path")
+        label = "estimate" if larger == 1.0 else f"estimate, error {larger:.0f} times as large"
+        axis.plot(*shown.T, color=common.RED, linewidth=1, label=label)
+        axis.set_title(f"the worst run, {one['run']}")
+        axis.legend()
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def _draw_devices(axis: Any, told: common.Numbers) -> None:
+    rows = told["devices"]["rows"] if told else []
+    if not rows:
+        return
+    names = [f"{row['devices']} device{'s' * (row['devices'] > 1)}" for row in rows]
+    bars = axis.bar(names, [1e3 / row["ms_per_scan"] for row in rows], color=common.SKY)
+    axis.bar_label(bars, fmt="%.0f")
+    axis.set(ylabel="scans a second")
+    axis.set_title(f"two devices do {told['devices']['two_vs_one']:.2f} times as much")
+
+
+def _draw_scaling(axis: Any, told: common.Numbers, key: str, label: str) -> None:
+    styles = zip((common.BLUE, common.RED, common.GREEN), ("o-", "s--", "^:"), strict=True)
+    for name, (colour, style) in zip(scaling.VARIED, styles, strict=True):
+        rows = [row for row in told.get(name, []) if key in row]
+        found = [row[name] for row in rows], [row[key] for row in rows]
+        axis.plot(*found, style, color=colour, label=f"number of {name}")
+    axis.set(xscale="log", ylabel=label, ylim=(0, None))
+    usual = f"{scaling.RUNS} runs, {scaling.STEPS} scans, {scaling.LANDMARKS} landmarks"
+    axis.set_xlabel(f"one of them varied, else {usual}")
+    axis.legend()
+
+
+def replay(case: Case, run: int) -> common.Numbers:
+    """Drive one run of the experiment alone; its errors."""
+    path, robot = jnp.asarray(case.path, float), case.robot
+    place = world.World(jnp.asarray(case.walls, float))
+    steps = case.steps or monte_carlo.drive_steps(robot, path)
+    key, noise = jax.random.key(case.seed), slam.wheel_noise(robot)
+    given = key, case.config, noise, place, robot, path
+    alone = monte_carlo.experiment(*given, runs=run + 1, steps=steps, first=run)
+    return {"run": run} | summary(key, monte_carlo.collect(alone))
+
+
+def together(given: Any) -> processes.Group | None:
+    """The processes that the arguments ask for; None for this one alone.
+
+    Raises:
+        InputError: They do not fit together.
+    """
+    if not given.coordinator_address:
+        if given.num_processes or given.process_id >= 0:
+            raise InputError("is missing", field="--coordinator_address")
+        return processes.local(given.processes) if given.processes > 1 else None
+    if not 0 <= given.process_id < given.num_processes:
+        raise InputError("is not below --num_processes", field="--process_id")
+    return processes.Group(given.coordinator_address, given.num_processes, (given.process_id,))
+
+
+def compute(
+    case: Case, runs: int, folder: Path, group: processes.Group | None = None
+) -> common.Numbers | None:
+    """Errors of B runs on all devices of a group of processes; None where process 0 is not."""
+    if group is None:
+        use_cores()
+        return work(case, runs, folder, sys.stderr)
+    results = processes.run(group, work, case, runs, folder)
+    if 0 not in group.own:
+        return None
+    # The memory of all processes of this machine counts.
+    return results[0] | {"peak_mb": sum(one["peak_mb"] for one in results)}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
+    flags = {"processes": 1, "coordinator_address": "", "num_processes": 0, "process_id": -1}
+    given = common.parse(__doc__, argv, runs=10_000, replay=-1, **flags)
+    folder = given.out / f"{NAME}_runs"
+    try:
+        if given.runs < 1:
+            raise InputError("is not positive", field="--runs")
+        case = office(given.seed)
+        if given.replay >= 0:
+            told = replay(case, given.replay)
+            print({key: told[key] for key in ("run", "position_rmse_m", "diverged", "nonfinite")})
+            return 0
+        numbers = compute(case, given.runs, folder, together(given))
+        if numbers is None:
+            print("done; process 0 has the results")
+            return 0
+        numbers |= {"scaling": scaling.compute(given.seed, min(2, os.cpu_count() or 1))}
+    except (InputError, processes.Lost) as error:
+        print(f"{NAME}: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
+        return 130
+    common.save(given.out, NAME, numbers, draw)
+    shutil.rmtree(folder, ignore_errors=True)
+    shown = "position_rmse_m", "p50_m", "p95_m", "p99_m", "diverged", "nonfinite", "peak_mb"
+    print({key: numbers[key] for key in (*shown, "seconds", "seconds_per_scan", "devices")})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -393,7 +393,7 @@ def test_a_data_set_or_its_robots_can_be_named(drives):
     assert tuning._robots(drives / "Barcodes.dat") is None
 
 
-def test_a_broken_checkpoint(refused, done, drives, tmp_path):
+def test_a_broken_checkpoint(refused, drives, tmp_path):
     out = tmp_path / "some"
     out.mkdir()
     (out / tuning.CHECKPOINT).write_bytes(b"what")

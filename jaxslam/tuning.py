@@ -207,7 +207,8 @@ def _recorded(
 
     def make() -> Job:
         train, tests = ([read(one) for one in some] for some in parts)
-        title = f"{len(train)} recorded drives, {sum(len(one.truth) for one in train)} steps"
+        drives = f"{len(train)} recorded drive{'s' if len(train) > 1 else ''}"
+        title = f"{drives}, {sum(len(one.truth) for one in train)} steps"
         print(f"{title}; held out: {len(tests)}", flush=True)
         heldout = log_of.stack(tests) if tests else None
         return Job(config, start, log_of.stack(train), heldout, title)
@@ -297,7 +298,7 @@ def _judge(job: Job, found: fit.Fit, options: dict[str, Any]) -> report.Numbers:
         "skipped": int(found.skipped.sum()),
         "noise": found.noise,
         "standard_errors": None,
-        "warnings": [],
+        "warnings": ["one drive alone tells no standard errors"],
     }
     if len(job.train.motion) >= 2:
         sure = curvature.standard_errors(found.noise, job.config, job.train, **options)

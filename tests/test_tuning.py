@@ -393,7 +393,7 @@ def test_a_data_set_or_its_robots_can_be_named(drives):
     assert tuning._robots(drives / "Barcodes.dat") is None
 
 
-def test_a_broken_checkpoint(refused, done, drives, tmp_path):
+def test_a_broken_checkpoint(refused, drives, tmp_path):
     out = tmp_path / "some"
     out.mkdir()
     (out / tuning.CHECKPOINT).write_bytes(b"what")
@@ -432,3 +432,20 @@ def test_an_interrupt_of_the_judgement_says_that_the_noise_is_there(
     )
     assert {file.name for file in out.iterdir()} == {"noise.json", tuning.CHECKPOINT}
     assert evaluations(out) == 3
+
+
+def test_simulated_drives_are_parted_into_those_to_tune_on_and_the_others(monkeypatch):
+    asked = []
+
+    def simulate(*given, runs, steps):
+        asked.append((given[-1].shape[1], steps))
+        return {"run": np.arange(runs)}
+
+    monkeypatch.setattr(tuning.monte_carlo, "drive_steps", lambda *_: 7)
+    monkeypatch.setattr(tuning.monte_carlo, "simulate", simulate)
+    for heldout, test in ((2, [3, 4]), (0, None)):
+        job = tuning._simulated("office", 3, heldout, None, 0)()
+        np.testing.assert_array_equal(job.train["run"], [0, 1, 2])
+        assert (job.test if test is None else job.test["run"].tolist()) == test
+        assert job.noise.scale == slam.log_noise().scale
+    assert asked == [(2, 7)] * 2

@@ -342,7 +342,7 @@ def main(argv: list[str] | None = None) -> int:
         if numbers is None:
             print("done; process 0 has the results")
             return 0
-        numbers |= {"scaling": scaling.compute(given.seed, min(2, os.cpu_count() or 1))}
+        numbers |= {"scaling": scaling.compute(given.seed)}
     except (InputError, processes.Lost) as error:
         print(f"{NAME}: error: {error}", file=sys.stderr)
         return 2

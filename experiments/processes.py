@@ -5,6 +5,7 @@ tells what happened in one line, and leaves no process behind.
 """
 
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -76,15 +77,18 @@ def run(group: Group, work: Callable, *given: Any) -> list[Any]:
             children[number] = (child, here)
     finally:
         _restore_interrupts(kept)
+    told = False  # where the logs are
     try:
         _follow(group, children, results, monotonic() + WAIT, logs)
+    except Lost as error:
+        told = str(logs) in str(error)
+        raise
     finally:
         for child, _ in children.values():
             child.kill()
             child.join()
-    for file in logs.iterdir():
-        file.unlink()
-    logs.rmdir()
+        if not told:
+            shutil.rmtree(logs, ignore_errors=True)
     return [results[number] for number in group.own]
 
 
@@ -98,8 +102,7 @@ def _follow(group: Group, children: dict, results: dict, deadline: float, logs: 
             raise _missing(group)
         ended = []
         for number, (child, pipe) in open_.items():
-            # What a process has said before it ended counts.
-            done = not child.is_alive()
+            gone = not child.is_alive()  # what it has said before counts
             for what, value in _heard(pipe):
                 if what == "up":
                     up.add(number)
@@ -108,19 +111,24 @@ def _follow(group: Group, children: dict, results: dict, deadline: float, logs: 
                 elif what == "refused":
                     raise InputError(value)
                 else:
-                    ended.append((0, number, value))
-            if done and number not in results:
+                    ended.append((number, value))
+            if gone and number not in results:
                 child.join()
-                # An abort is how JAX ends those that have lost another.
-                aborted = child.exitcode == -signal.SIGABRT
-                ended.append((1 + aborted, number, f"exit code {child.exitcode}"))
+                ended.append((number, child.exitcode))
         if ended:
-            _, number, why = min(ended, key=lambda one: (one[0] == 2, one[0]))
-            if number not in up and why == f"exit code {-signal.SIGABRT}":
-                raise _missing(group)
-            if why == f"exit code {-signal.SIGABRT}":
-                why = "it has lost another one"
-            raise Lost(f"process {number} of {group.count} ended early ({why}); see {logs}")
+            raise _early(group, ended, up, logs)
+
+
+def _early(group: Group, ended: list, up: set[int], logs: Path) -> Lost:
+    """What to say of processes that ended early, each with its error or exit code."""
+    # An abort is how JAX ends those that have lost another, or have found none.
+    number, why = min(ended, key=lambda one: (one[1] == -signal.SIGABRT, isinstance(one[1], int)))
+    if why == -signal.SIGABRT:
+        if number not in up:
+            return _missing(group)
+        why = "it has lost another one"
+    why = f"exit code {why}" if isinstance(why, int) else why
+    return Lost(f"process {number} of {group.count} ended early ({why}); see {logs}")
 
 
 def _missing(group: Group) -> Lost:

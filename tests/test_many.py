@@ -1,11 +1,13 @@
 """The experiment of many drives: on several processes, and stopped and gone on with."""
 
 import json
+import multiprocessing
 import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 from io import StringIO
 from time import monotonic, sleep
 
@@ -111,18 +113,14 @@ def test_each_process_returns_what_it_found(capfd):
         (0, "refuse", InputError, "--this: is bad"),
     ],
 )
-def test_a_process_that_ends_early_ends_all(who, how, kind, line):
+def test_a_process_that_ends_early_ends_all(who, how, kind, line, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     begin = monotonic()
     with pytest.raises(kind, match=re.escape(line)):
         processes.run(processes.local(2), die, who, how)
     assert monotonic() - begin < 60
-    assert not children()
-
-
-def children():
-    import multiprocessing
-
-    return multiprocessing.active_children()
+    assert not multiprocessing.active_children()
+    assert any(tmp_path.iterdir()) is (kind is processes.Lost)  # what it printed
 
 
 @pytest.mark.timeout(120)
@@ -302,13 +300,13 @@ def test_scaling_measures_each_figure_in_its_own_process(monkeypatch):
         return {"seconds": 3.0 / devices, "devices": devices} | given
 
     monkeypatch.setattr(scaling, "apart", measured)
-    numbers = scaling.compute(0, 2)
+    numbers = scaling.compute(0)
     assert numbers["devices"]["two_vs_one"] == pytest.approx(2.0)
     for name, values in scaling.VARIED.items():
         assert [one[name] for one in numbers[name]] == list(values)
     assert {one[0] for one in asked} == {1, 2}
     monkeypatch.setattr(scaling, "apart", lambda *_, **__: {"chain_note": "it failed"})
-    none = scaling.compute(0, 2)["devices"]
+    none = scaling.compute(0)["devices"]
     assert none == {"two_vs_one": None, "rows": [], "chain_note": "it failed"}
 
 

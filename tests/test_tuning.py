@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam import cli, fit, geometry, slam, tuning
+from jaxslam import cli, fit, geometry, losses, slam, tuning
 from jaxslam.io import carmen, mrclam, noise, tum
 
 # The command runs in processes of its own, in float32 as users run it, on drives so short and with
@@ -23,6 +23,7 @@ START = 1248272000.125  # [s]
 PLACES = {6: (3.0, 1.0), 7: (-2.5, 3.0), 8: (0.5, -2.5), 9: (0.0, 5.0)}
 RANGE, BEARING = 0.05, 0.02  # noise of the sightings
 ROBOTS, STEPS = 5, 12
+KILLS = 2  # of which it must lose nothing
 FILES = {"noise.json", "metrics.json", "history.png"}
 
 
@@ -112,9 +113,9 @@ def done(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stopped(done):
-    """A tuning that was killed five times, then interrupted; and how it went on."""
+    """A tuning that was killed again and again, then interrupted; and how it went on."""
     out, rng, history = done.place / "a" / "stopped", np.random.default_rng(7), []
-    for _ in range(5):
+    for _ in range(KILLS):
         process = begin(done.place, out)
         wait(process, out, evaluations(out))
         time.sleep(rng.uniform(0.0, 0.05))
@@ -157,7 +158,7 @@ def test_its_noise_is_that_of_its_numbers_and_goes_back_in(done):
     for name, value in found._asdict().items():
         np.testing.assert_allclose(value, done.numbers["noise"][name], rtol=1e-6)
     job = tuning._recorded(
-        [done.place / "drives"], (), (), done.out / "noise.json", fit.localisation
+        [done.place / "drives"], (), (), done.out / "noise.json", losses.localisation
     )
     assert job().noise._asdict().keys() == found._asdict().keys()
     for a, b in zip(job().noise, found, strict=True):

@@ -1,6 +1,9 @@
 """What every experiment shares: its arguments, its two files, and pictures of cells."""
 
 import argparse
+import hashlib
+import json
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -10,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxslam
 from jaxslam import slam, voronoi, world
 from jaxslam.grid import GridSpec, centres
 from jaxslam.io.output import plain, write_json
@@ -48,6 +52,42 @@ def parse(description: str | None, argv: list[str] | None = None, **extra: Any):
     for name, default in extra.items():
         parser.add_argument(f"--{name}", type=type(default), default=default)
     return parser.parse_args(argv)
+
+
+class Kept:
+    """Parts of an experiment that are kept as files until it is done, so that it can be stopped."""
+
+    def __init__(self, folder: Path, about: Any):
+        """Keep parts in `folder`; those of another program, or `about` something else, are not."""
+        self._folder = folder
+        self._about = f"{about!r}, {program()}"
+
+    def __call__(self, name: str, make: Callable[[], Numbers]) -> Numbers:
+        """What `make` returns, as JSON has it: made now, or by an earlier call."""
+        file = self._folder / f"{name.replace(' ', '_')}.json"
+        if file.is_file():
+            try:
+                found = json.loads(file.read_text(encoding="utf-8"))
+                if found["about"] == self._about:
+                    return found["numbers"]
+            except (ValueError, KeyError, TypeError):
+                pass  # made anew
+        numbers = plain(make())
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_json(file, {"about": self._about, "numbers": numbers})
+        return numbers
+
+    def clear(self) -> None:
+        """Remove all of it."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def program() -> str:
+    """What tells the library's program from others: a number that depends on all of its text."""
+    text = hashlib.sha256(jax.__version__.encode())
+    for file in sorted(Path(jaxslam.__file__).parent.rglob("*.py")):
+        text.update(file.read_bytes())
+    return text.hexdigest()[:16]
 
 
 def save(out: Path, name: str, numbers: Numbers, draw: Callable[[Numbers, Path], None]) -> None:

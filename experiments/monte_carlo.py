@@ -27,7 +27,6 @@ import numpy as np
 from jax.experimental import multihost_utils
 from tqdm import tqdm
 
-import jaxslam
 from experiments import common, processes, scaling
 from experiments.estimator import peak
 from jaxslam import metrics, monte_carlo, plan, slam, world
@@ -150,11 +149,9 @@ def summary(key: Any, tracks: Track) -> common.Numbers:
 
 def fingerprint(case: Case, noise: slam.Noise) -> str:
     """What must be the same for runs to be of one experiment: the case and the program."""
-    text = hashlib.sha256(repr((case._replace(walls=0, path=0), jax.__version__)).encode())
+    text = hashlib.sha256(repr((case._replace(walls=0, path=0), common.program())).encode())
     for x in (case.walls, case.path, *jax.tree.leaves(noise)):
         text.update(np.asarray(x, float).tobytes())
-    for file in sorted(Path(jaxslam.__file__).parent.rglob("*.py")):
-        text.update(file.read_bytes())
     return f"{case.seed}, {text.hexdigest()[:16]}"
 
 

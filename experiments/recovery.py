@@ -1,122 +1,130 @@
-"""Drives for which the filter's model is exactly true, so that tuning has a right answer.
+"""Whether tuning finds the noise that drives were made with, from wherever it starts.
 
-They go through the office. Odometry errs by a draw of its process noise. Up to six landmarks near
-by, which are told apart, and the direction of the walls are seen with a draw of the sensor noise.
+Part of `experiments.tuning`. The drives are those of `experiments.exact`, for which the filter's
+model is true. Each start is off in every parameter by a factor of its own, at most `FACTOR`.
 """
 
-from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax.flatten_util import ravel_pytree
+from tqdm import tqdm
 
-from experiments import common
-from jaxslam import monte_carlo, motion, plan, world
-from jaxslam.geometry import compose, wrap_line
+from experiments import common, exact
+from jaxslam import curvature, fit, monte_carlo
 from jaxslam.monte_carlo import Log
-from jaxslam.nodes import Nodes, blank
-from jaxslam.noise import Noise, sensor_noise
-from jaxslam.sensor import expect
-from jaxslam.slam import Config
-from jaxslam.types import NODE, WALL, Array, Key
+from jaxslam.slam import Noise
 
-PLACES = 40  # landmarks; the next number is the direction of the walls
-SEEN = 6  # of them in a scan at most
-NEAR, FAR = 0.7, 4.0  # [m] from which to which the robot sees them
-OWN, OWN_WALL = 0.004, 0.002  # [m], [rad] about which their own standard deviation is
-CONFIG = Config(landmarks=PLACES + 1, matches=SEEN + 1, fresh=SEEN + 1, kinds=(NODE, WALL))
+FACTOR = 5.0
+PACK = 32  # runs of a step at first
+ROUGH, FINE = 40, 15  # steps with some of the runs, then with all
 
 
-def truth() -> Noise:
-    """The noise that the drives are made with."""
-    odometry = motion.wheel_coefficients(motion.Robot())
-    rest = {"range": 0.01, "bearing": 0.005, "scale": 1.0, "wall": 0.002}
-    return Noise(jnp.asarray(odometry, float), *(jnp.asarray(x, float) for x in rest.values()))
+def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) -> common.Numbers:
+    """Tune from all starts on the same runs; compare the noise, and errors on other runs.
+
+    Standard errors are those of the best of the fits, by its loss.
+    """
+    truth = exact.truth()
+    logs = exact.drives(jax.random.key(seed), truth, runs=runs + heldout)
+    train, test = (_part(logs, part) for part in (slice(runs), slice(runs, None)))
+    right = position_rmse(truth, test)
+    rows = []
+    with tqdm(total=starts, unit="start", desc="recovery", leave=False) as bar:
+        for number in range(starts):
+            rows.append(kept(f"start {number}", lambda n=number: _recover(seed, n, train, test)))
+            bar.update()
+    best = min(rows, key=lambda row: row["loss"])
+    sure = kept("standard errors", lambda: _errors(noise_of(best["theta"]), train))
+    se = np.array([np.nan if x is None else x for x in sure["relative"]])
+    known = np.array(sure["identifiable"])
+    off = np.array([row["theta"] for row in rows]) - _theta(truth)
+    z = off[:, known] / se[known]
+    ratio = np.array([row["heldout_rmse_m"] for row in rows]) / right
+    return {
+        "starts": starts,
+        "runs": runs,
+        "heldout": heldout,
+        "within_3_se": int(np.sum(np.all(np.abs(z) < 3.0, axis=1))),
+        "worst_z": float(np.abs(z).max()),
+        "worst_heldout_ratio": float(ratio.max()),
+        "heldout_rmse_true_noise_m": right,
+        "names": sure["names"],
+        "identifiable": sure["identifiable"],
+        "standard_errors": sure["relative"],
+        "warnings": sure["warnings"],
+        "log_truth": _theta(truth),
+        "rows": rows,
+    }
 
 
-def marks() -> np.ndarray:
-    """Landmarks (PLACES, 2) [m]: ends of the office's walls, as far apart as may be."""
-    ends = np.unique(np.asarray(world.named("office").walls).reshape(-1, 2), axis=0)
-    chosen, gap = [ends[0]], np.full(len(ends), np.inf)
-    for _ in range(PLACES - 1):
-        gap = np.minimum(gap, np.linalg.norm(ends - chosen[-1], axis=1))
-        chosen.append(ends[np.argmax(gap)])
-    return np.array(chosen)
+def _recover(seed: int, number: int, train: Log, test: Log) -> common.Numbers:
+    """Tune from a start drawn at random."""
+    truth = _theta(exact.truth())
+    reach = np.log(FACTOR)
+    start = truth + np.random.default_rng([seed, number]).uniform(-reach, reach, truth.size)
+    given = exact.CONFIG, train
+    rough = fit.tune(noise_of(start), *given, steps=ROUGH, batch=PACK, seed=number)
+    fine = fit.tune(rough.noise, *given, steps=FINE)
+    return {
+        "start": start,
+        "theta": _theta(fine.noise),
+        "loss": fine.loss[fine.best],
+        "skipped": int(rough.skipped.sum() + fine.skipped.sum()),
+        "heldout_rmse_m": position_rmse(fine.noise, test),
+    }
 
 
-def _root(cov: Array) -> Array:
-    """Lower triangle (n, n) L with L L^T = cov, which may be semi-definite."""
-    eye = jnp.eye(len(cov), dtype=cov.dtype)
-    return jnp.linalg.cholesky(cov + 1e-12 * eye)
+def _errors(noise: Noise, train: Log) -> common.Numbers:
+    sure = curvature.standard_errors(noise, exact.CONFIG, train)
+    return {**sure._asdict()}
 
 
-def see(key: Key, noise: Noise, places: Array, pose: Array) -> tuple[Nodes, Array]:
-    """What the robot sees from a pose (3,): features, and which landmark each is (SEEN + 1,)."""
-    keys = jax.random.split(key, 2)
-    away = jnp.linalg.norm(places - pose[None, :2], axis=1)
-    order = jnp.argsort(jnp.where(away > NEAR, away, jnp.inf))[:SEEN].astype(jnp.int32)
-    valid = jnp.append((away[order] > NEAR) & (away[order] < FAR), True)
-    kind = jnp.append(jnp.full(SEEN, NODE, jnp.int32), jnp.int32(WALL))
-    spots = jnp.concatenate([places[order], jnp.zeros((1, 2), places.dtype)])
-    exact = jax.vmap(expect, in_axes=(None, 0, 0))(pose, spots, kind)[0]
-    # Their own covariance differs from one to the next: it and the rest can be told apart.
-    wide = jnp.exp(jax.random.uniform(keys[0], (SEEN + 1,), pose.dtype, -1.2, 1.2))
-
-    def features(polar: Array) -> Nodes:
-        xy = polar[:, :1] * jnp.stack([jnp.cos(polar[:, 1]), jnp.sin(polar[:, 1])], axis=1)
-        zero = jnp.zeros_like(wide)
-        return Nodes(
-            kind=kind,
-            xy=jnp.where((kind == WALL)[:, None], 0.0, xy),
-            cov=(OWN * wide)[:, None, None] ** 2 * jnp.eye(2, dtype=pose.dtype)[None],
-            direction=jnp.where(kind == WALL, wrap_line(polar[:, 0]), 0.0),
-            variance=(OWN_WALL * wide) ** 2,
-            shape=zero + 1.0,
-            degree=jnp.zeros(SEEN + 1, jnp.int32),
-            certified=valid,
-            trusted=valid,
-            valid=valid,
-        )
-
-    spread = jax.vmap(_root)(sensor_noise(noise, features(exact)))
-    error = jnp.einsum("mij,mj->mi", spread, jax.random.normal(keys[1], exact.shape, exact.dtype))
-    one = jnp.ones_like(wide)  # a wall's direction is one number
-    error = error * jnp.stack([one, jnp.where(kind == NODE, one, 0.0)], axis=1)
-    who = jnp.append(order, jnp.int32(PLACES))
-    return blank(features(exact + error)), jnp.where(valid, who, -1)
+def position_rmse(noise: Noise, logs: Log) -> float:
+    """Position RMSE [m] of the filter on drives [B]."""
+    return monte_carlo.evaluate(monte_carlo.tracks(exact.CONFIG, noise, logs))["position_rmse_m"]
 
 
-def drive(key: Key, noise: Noise, path: Array, places: Array, *, steps: int) -> Log:
-    """One drive along a path (N, 2), steered by the true pose."""
-
-    def body(now: tuple[Array, Array], key: Key) -> tuple[tuple[Array, Array], tuple]:
-        pose, place = now
-        keys = jax.random.split(key)
-        told, place = plan.follow(path, place, pose)
-        slip = _root(motion.process_noise(noise.odometry, told))
-        moved = told + slip @ jax.random.normal(keys[0], (3,), pose.dtype)
-        moves = jnp.any(told != 0.0)
-        pose = compose(pose, jnp.where(moves, moved, 0.0))
-        return (pose, place), (pose, told, *see(keys[1], noise, places, pose))
-
-    first = monte_carlo.start(path)
-    keys = jax.random.split(key, steps)
-    begin = first, jnp.zeros(3, path.dtype), *see(keys[0], noise, places, first)
-    _, rest = lax.scan(body, (first, jnp.int32(0)), keys[1:])
-    whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, rest)
-    return Log(*whole)
+def noise_of(theta: Any) -> Noise:
+    """Noise of the logarithms (P,) of its parameters."""
+    flat, unravel = ravel_pytree(exact.truth())
+    return fit.constrain(unravel(jnp.asarray(theta, flat.dtype)))
 
 
-@partial(jax.jit, static_argnames=("runs", "steps"))
-def _drives(key: Key, noise: Noise, path: Array, places: Array, *, runs: int, steps: int) -> Log:
-    keys = monte_carlo.run_keys(key, jnp.arange(runs))
-    return lax.map(lambda key: drive(key, noise, path, places, steps=steps), keys)
+def _theta(noise: Noise) -> np.ndarray:
+    """Logarithms (P,) float64 of a noise."""
+    return np.log(np.asarray(ravel_pytree(noise)[0], np.float64))
 
 
-def drives(key: Key, noise: Noise, *, runs: int, steps: int | None = None) -> Log:
-    """B drives from S to F through the office, or their first steps; NumPy arrays."""
-    _, robot, path, scans = common.scene()
-    places = jnp.asarray(marks(), path.dtype)
-    made = _drives(key, noise, path, places, runs=runs, steps=scans if steps is None else steps)
-    return jax.tree.map(np.asarray, made)
+def _part(logs: Log, chosen: slice) -> Log:
+    return jax.tree.map(lambda x: x[chosen], logs)
+
+
+def draw(axis: Any, told: common.Numbers) -> None:
+    """Where tuning ended, from all starts, in standard errors of each parameter."""
+    off = np.array([row["theta"] for row in told["rows"]]) - np.array(told["log_truth"])
+    start = np.array([row["start"] for row in told["rows"]]) - np.array(told["log_truth"])
+    rng = np.random.default_rng(0)
+    for i, sure in enumerate(told["identifiable"]):
+        x = i + rng.uniform(-0.25, 0.25, len(off))
+        axis.plot(x, np.exp(start[:, i]), "o", color=common.SKY, markersize=4, alpha=0.6)
+        colour = common.GREEN if sure else common.ORANGE
+        axis.plot(x, np.exp(off[:, i]), "D", color=colour, markersize=4)
+        if sure:
+            band = np.exp(3 * told["standard_errors"][i])
+            axis.fill_between([i - 0.4, i + 0.4], 1 / band, band, color=common.BLACK, alpha=0.2)
+    axis.axhline(1.0, color=common.BLACK, linewidth=0.8)
+    for colour, marker, label in (
+        (common.SKY, "o", "start"),
+        (common.GREEN, "D", "found"),
+        (common.ORANGE, "D", "found, told to be not identifiable"),
+    ):
+        axis.plot([], [], marker, color=colour, label=label)
+    axis.fill_between([], [], color=common.BLACK, alpha=0.2, label="3 standard errors")
+    low = min(0.15, *np.exp(off.min(axis=0)))
+    axis.set(yscale="log", ylabel="noise / true noise", ylim=(max(low, 0.02), 8.0))
+    axis.set_xticks(range(len(told["names"])), told["names"], rotation=30, ha="right")
+    axis.set_title(f"{told['starts']} starts, {told['runs']} runs")
+    axis.legend(fontsize="small")

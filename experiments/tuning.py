@@ -1,96 +1,195 @@
-"""Noise by gradient: from three times too large, tuned on some runs and judged on others.
+"""Noise by gradient, by hand, by likelihood, at random and by Bayesian optimisation.
 
-The simulated robot's true encoder noise is known, and so is what its front end's landmarks are
-worth; the filter starts with all of it three times too large.
+On simulated drives through the office and, with `--mrclam FOLDER`, on the MRCLAM data set there:
+robots 1 to 3 train, 4 and 5 judge. Each search goes on for ten times as long as the tuning by
+gradient. After that, whether tuning finds a noise that is known (`recovery`). The same command
+goes on where it was stopped.
 """
 
+import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
-from experiments import common
-from jaxslam import fit, monte_carlo, slam
-from jaxslam.losses import calibrated
+from experiments import common, recovery, search
+from jaxslam import logs as log_of
+from jaxslam import monte_carlo, slam
+from jaxslam.batches import use_cores
+from jaxslam.io import mrclam
+from jaxslam.io.errors import InputError
+from jaxslam.losses import calibrated, likelihood
+from jaxslam.noise import log_noise, sighting_noise
+from jaxslam.options import keep_compiled
 
-FACTOR = 3.0
+NAME = "tuning"
+TRAIN, JUDGE = (1, 2, 3), (4, 5)  # robots of MRCLAM
+STEPS = {"office": 25, "mrclam": 40}
+LONGER = 10.0  # times as long as the gradient that the others search
+LANDMARKS = 64  # of the map of the office
+DATA = {"office": "office", "mrclam": "MRCLAM"}
+STYLES = {
+    "hand": (common.BLACK, ":"),
+    "gradient": (common.GREEN, "-"),
+    "likelihood": (common.PINK, "-."),
+    "random": (common.ORANGE, "--"),
+    "bayesian": (common.BLUE, "--"),
+}
 
 
-def compute(seed: int, runs: int, heldout: int, steps: int) -> common.Numbers:
-    """Tune on `runs` runs; position RMSE on `heldout` others, before, after and with the truth."""
-    config = slam.Config(landmarks=64)
+def office(seed: int, runs: int, heldout: int) -> search.Task:
+    """Simulated drives; by hand: the noise for a robot that nothing is known of."""
+    config = slam.Config(landmarks=LANDMARKS)
     place, robot, path, scans = common.scene()
+    total = runs + heldout
     logs = monte_carlo.simulate(
-        jax.random.key(seed), config, place, robot, path, runs=runs + heldout, steps=scans
+        jax.random.key(seed), config, place, robot, path, runs=total, steps=scans
     )
-    train = jax.tree.map(lambda x: x[:runs], logs)
-    test = jax.tree.map(lambda x: x[runs:], logs)
-    truth = slam.wheel_noise(robot)
-    start = jax.tree.map(lambda x: FACTOR * x, truth)
-    with tqdm(total=steps + 1, unit="step", leave=False) as bar:
+    train, test = (search.part(logs, part) for part in (slice(runs), slice(runs, total)))
+    return search.Task(config, log_noise(), train, test)
 
-        def report(state: fit.State) -> None:
-            bar.set_postfix(loss=f"{state.loss[state.step - 1]:.4g}")
-            bar.update()
 
-        found = fit.tune(start, config, train, loss=calibrated, steps=steps, report=report)
-    judged = {
-        name: monte_carlo.evaluate(monte_carlo.tracks(config, noise, test))
-        for name, noise in (("start", start), ("tuned", found.noise), ("true_noise", truth))
+def recorded(folder: Path) -> search.Task:
+    """Drives of MRCLAM; by hand: range 0.15 m, bearing 0.03 rad, odometry 10 %."""
+    every = [mrclam.read(folder, robot) for robot in TRAIN + JUDGE]
+    logs = [log_of.from_sightings(one) for one in every]
+    parts = logs[: len(TRAIN)], logs[len(TRAIN) :]
+    train, test = (log_of.stack(part) for part in parts)
+    # There are no walls.
+    return search.Task(log_of.config_of(every), sighting_noise(), train, test, ("wall",))
+
+
+def compare(
+    data: str, task: search.Task, seed: int, steps: int, kept: common.Kept
+) -> tuple[list[common.Numbers], common.Numbers]:
+    """A row for each method, and the traces that they were read off."""
+    traces = {}
+    compiled = set()
+
+    def run(method: str, loss: Any, make: Any) -> None:
+        def timed() -> common.Numbers:
+            if loss not in compiled:
+                search.compile_all(task, loss)
+                compiled.add(loss)
+            return make()
+
+        traces[method] = kept(f"{data} {method}", timed)
+
+    for method, loss in (("gradient", calibrated), ("likelihood", likelihood)):
+        run(method, loss, lambda loss=loss: search.by_gradient(task, loss, steps))
+    own = traces["gradient"]
+    limits = LONGER * own["seconds"], own["evaluations"]
+    for method in search.METHODS:
+        run(method, calibrated, lambda m=method: search.by_search(task, m, seed, *limits))
+    first = own["points"][0]
+    rows = [_row(data, "hand", first, 0.0, 0, own, first)]
+    for method, trace in traces.items():
+        last, total = trace["points"][-1], (trace["seconds"], trace["evaluations"])
+        within = search.best_by(trace, evaluations=own["evaluations"])
+        rows.append(_row(data, method, last, *total, own, within, trace))
+    return rows, traces
+
+
+def _row(
+    data: str,
+    method: str,
+    last: common.Numbers,
+    seconds: float,
+    evaluations: int,
+    own: common.Numbers,
+    within: common.Numbers,
+    trace: common.Numbers | None = None,
+) -> common.Numbers:
+    """What a method found, also in the time and the evaluations of the gradient `own`."""
+    row = {
+        "data": data,
+        "method": method,
+        "heldout_rmse_m": last["heldout_rmse_m"],
+        "nees": last["nees"],
+        "seconds": seconds,
+        "evaluations": evaluations,
+        "heldout_rmse_at_equal_evaluations_m": within["heldout_rmse_m"],
     }
-    fields = lambda noise: {k: np.asarray(v) for k, v in noise._asdict().items()}
-    return {
-        "seed": seed,
-        "runs": runs,
-        "heldout": heldout,
-        **{f"heldout_rmse_{name}_m": e["position_rmse_m"] for name, e in judged.items()},
-        **{f"heldout_heading_{name}_deg": e["heading_rmse_deg"] for name, e in judged.items()},
-        **{f"heldout_nees_{name}": e["nees"] for name, e in judged.items()},
-        "loss": found.loss,
-        "history": fields(found.history),
-        "noise": {
-            name: fields(noise)
-            for name, noise in (("start", start), ("tuned", found.noise), ("true_noise", truth))
-        },
+    if trace is None:
+        return row
+    early = search.best_by(trace, seconds=own["seconds"])
+    best = min(point["heldout_rmse_m"] for point in trace["points"])
+    return row | {
+        "heldout_rmse_at_equal_seconds_m": early["heldout_rmse_m"],
+        "best_heldout_rmse_m": best,
+        "seconds_to_best": search.time_to(trace, best),
+        "gradient_seconds_to_that": search.time_to(own, best),
     }
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """Loss and noise over the steps, errors before and after."""
-    figure, axes = common.canvas(12, 3.6, 1, 3)
-    loss, bars, noise = axes[0]
-    loss.plot(numbers["loss"], color=common.BLUE)
-    loss.set(xlabel="step", ylabel="training loss [nats a pose]")
-    names = ("start", "tuned", "true_noise")
-    drawn = bars.bar(
-        [name.replace("_", "\n") for name in names],
-        [100 * numbers[f"heldout_rmse_{name}_m"] for name in names],
-        color=(common.ORANGE, common.GREEN, common.BLACK),
-    )
-    bars.bar_label(drawn, fmt="%.2f")
-    bars.set(ylabel="held-out position RMSE [cm]")
-    true = numbers["noise"]["true_noise"]
-    colours = iter((common.BLACK, common.ORANGE, common.SKY, common.GREEN, common.BLUE))
-    for name, values in numbers["history"].items():
-        ratio = np.array(values) / np.array(true[name])
-        colour = next(colours)
-        noise.plot(ratio, color=colour)
-        noise.plot([], color=colour, label=name)
-    noise.axhline(1.0, color=common.PINK, linestyle="--")
-    noise.set(xlabel="step", ylabel="noise / true noise", yscale="log")
-    noise.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    """Held-out error over time and over evaluations; where recovery ended."""
+    shown = list(numbers["traces"])
+    figure, axes = common.canvas(12, 4.2 * len(shown) + 4.2, len(shown) + 1, 2)
+    for (left, right), data in zip(axes, shown, strict=False):
+        _draw_traces(left, numbers, data, "seconds")
+        _draw_traces(right, numbers, data, "evaluations")
+    for axis in axes[-1]:
+        axis.remove()
+    wide = figure.add_subplot(axes[-1, 0].get_gridspec()[len(shown), :])
+    recovery.draw(wide, numbers["recovery"])
     figure.savefig(path)
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Run the experiment."""
-    given = common.parse(__doc__, argv, runs=16, heldout=32, steps=30)
-    numbers = compute(given.seed, given.runs, given.heldout, given.steps)
-    common.save(given.out, "tuning", numbers, draw)
-    for name in ("start", "tuned", "true_noise"):
-        print(f"held-out RMSE, {name:10}: {100 * numbers[f'heldout_rmse_{name}_m']:.2f} cm")
+def _draw_traces(axis: Any, numbers: common.Numbers, data: str, over: str) -> None:
+    traces = numbers["traces"][data]
+    for method, trace in traces.items():
+        colour, style = STYLES[method]
+        points = trace["points"]
+        x = [max(point[over], 1.0) for point in points] + [trace[over]]
+        y = [100 * point["heldout_rmse_m"] for point in points]
+        axis.step(x, y + y[-1:], style, where="post", color=colour, label=method)
+        axis.plot(x[-1], y[-1], "o", color=colour, markersize=4)
+    hand = 100 * traces["gradient"]["points"][0]["heldout_rmse_m"]
+    axis.axhline(hand, color=common.BLACK, linestyle=":", label="hand")
+    axis.set(xscale="log", yscale="log", ylabel="held-out position RMSE [cm]")
+    runs = "training runs, values and gradients alike" if over == "evaluations" else ""
+    axis.set_xlabel("time [s]" if over == "seconds" else f"evaluations of all {runs}")
+    axis.set_title(DATA[data])
+    axis.legend(fontsize="small")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
+    sizes = {"runs": 32, "heldout": 64, "starts": 20, "recovery_runs": 256}
+    given = common.parse(__doc__, argv, mrclam="", **sizes)
+    use_cores()
+    keep_compiled()
+    about = {key: str(value) for key, value in vars(given).items() if key != "out"}
+    kept = common.Kept(given.out / f"{NAME}_parts", about)
+    rows, traces = [], {}
+    try:
+        tasks = {"office": lambda: office(given.seed, given.runs, given.heldout)}
+        if given.mrclam:
+            task = recorded(Path(given.mrclam))
+            tasks["mrclam"] = lambda: task
+        for data, make in tasks.items():
+            more, traces[data] = compare(data, make(), given.seed, STEPS[data], kept)
+            rows += more
+        sizes = given.starts, given.recovery_runs, given.heldout
+        told = recovery.compute(given.seed, *sizes, kept)
+    except InputError as error:
+        print(f"{NAME}: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
+        return 130
+    numbers = {"seed": given.seed, "rows": rows, "recovery": told, "traces": traces}
+    common.save(given.out, NAME, numbers, draw)
+    kept.clear()
+    for row in rows:
+        error, nees = 100 * (row["heldout_rmse_m"] or np.nan), row["nees"] or np.nan
+        name = f"{row['data']:7} {row['method']:11}"
+        print(f"{name} {error:8.2f} cm  NEES {nees:7.2f}  {row['seconds']:6.0f} s")
+    print({key: told[key] for key in ("starts", "within_3_se", "worst_heldout_ratio")})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam import fit
-from jaxslam.losses import Loss, calibrated
+from jaxslam.losses import Loss, calibrated, check
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Noise
 
@@ -55,7 +55,7 @@ def standard_errors(
     References:
         White (1982), "Maximum likelihood estimation of misspecified models".
     """
-    fit.check(config, logs, loss)
+    check(loss, logs)
     runs = logs.motion.shape[0]
     if runs < 2:
         raise ValueError("standard errors need two runs or more")

@@ -17,14 +17,17 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
-from jaxslam import slam
+from jaxslam import losses, slam
 from jaxslam.batches import Spread
-from jaxslam.losses import Loss, calibrated, needs_truth
+from jaxslam.losses import Loss, calibrated
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array
 
 GROUP = 4  # runs that a device differentiates together; bounds memory
+MEMORY = 10  # steps that L-BFGS remembers
+REACH = 0.4  # by which one of them changes a logarithm at most
+RATE = 0.2  # first step of Adam
 
 
 class State(NamedTuple):
@@ -139,24 +142,6 @@ def mean_gradient(values: np.ndarray, each: np.ndarray) -> tuple[float, np.ndarr
     return values[good].mean(), each[good].mean(axis=0), int(np.sum(~good))
 
 
-def check(config: Config, logs: Log, loss: Loss, *, what: str = "logs") -> None:
-    """Raise ValueError where a loss cannot be had of runs, before any work starts.
-
-    Raises:
-        ValueError: There are no runs, or one has no truth and the loss needs it.
-    """
-    runs = logs.motion.shape[0]
-    if not runs:
-        raise ValueError(f"{what}: no runs to tune on")
-    if needs_truth(loss) and logs.judged is not None:
-        blind = np.flatnonzero(~np.asarray(logs.judged).any(axis=1))
-        if blind.size:
-            raise ValueError(
-                f"{what}: run {blind[0]} has no reference, which this loss needs; "
-                "give one, or use the likelihood"
-            )
-
-
 def draw(seed: int, step: int, runs: int, batch: int) -> np.ndarray:
     """Runs (batch,) of a step: the next of a shuffled pack of all, and shuffled anew after it."""
     place = step * batch + np.arange(batch)
@@ -192,8 +177,7 @@ def tune(
         logs: [B] training runs.
         loss: Mean of this over runs is made small; one of `losses`, or any function of the info
             of a filtered run and its log.
-        optimiser: Of the logarithms of the free parameters; Adam with a step of 0.1, which decays
-            to a tenth, unless given.
+        optimiser: Of the logarithms of the free parameters; that of `usual` unless given.
         steps: Number of updates.
         batch: Runs a step, in turn from a shuffled pack; all of them unless given.
         seed: Of that shuffle.
@@ -212,9 +196,9 @@ def tune(
         ValueError: Runs are too few or lack the truth that the loss needs, a name is none of a
             parameter, a number is out of range, or the noise is not positive.
     """
-    check(config, logs, loss)
+    losses.check(loss, logs)
     if heldout is not None:
-        check(config, heldout, loss, what="heldout")
+        losses.check(loss, heldout, what="heldout")
     for name, number in {"batch": batch, "every": every, "patience": patience}.items():
         if number is not None and number < 1:
             raise ValueError(f"{name} is {number}; it must be 1 or more")
@@ -222,7 +206,7 @@ def tune(
     start, unravel = ravel_pytree(noise)
     moves, runs = free(noise, frozen), logs.motion.shape[0]
     whole = batch is None or batch >= runs
-    optimiser = _adam(steps) if optimiser is None else optimiser
+    optimiser = usual(steps, whole=whole) if optimiser is None else optimiser
     if state is None:
         state = begin(noise, steps=steps, frozen=frozen, optimiser=optimiser)
     noise_of = lambda theta: constrain(unravel(jnp.asarray(theta, start.dtype)))
@@ -243,12 +227,26 @@ def tune(
     return result(state, noise, whole=whole)
 
 
+def usual(steps: int, *, whole: bool) -> optax.GradientTransformation:
+    """What `tune` descends by unless told.
+
+    Where all runs are seen in each step, the gradients of some steps compare: L-BFGS, which finds
+    its way along the narrow valleys between parameters that do nearly the same. It takes its steps
+    without a line search, and none changes a logarithm by more than `REACH`. Else Adam, with a step
+    that decays to a tenth.
+    """
+    if whole:
+        newton = optax.scale_by_lbfgs(memory_size=MEMORY)
+        return optax.chain(newton, optax.clip(REACH), optax.scale(-1.0))
+    return optax.adam(optax.cosine_decay_schedule(RATE, max(steps, 1), alpha=0.1))
+
+
 def begin(
     noise: Noise,
     *,
     steps: int,
+    optimiser: optax.GradientTransformation,
     frozen: Collection[str] = (),
-    optimiser: optax.GradientTransformation | None = None,
 ) -> State:
     """The state before the first evaluation; the arguments are those of `tune`.
 
@@ -259,7 +257,6 @@ def begin(
     if not (np.isfinite(start) & (start > 0.0)).all():
         raise ValueError(f"the noise to start from is not positive: {noise}")
     theta, none = np.log(start), np.full(steps + 1, np.nan)
-    optimiser = _adam(steps) if optimiser is None else optimiser
     return State(
         step=np.int64(0),
         theta=theta,
@@ -269,10 +266,6 @@ def begin(
         heldout=none,
         skipped=np.zeros(steps + 1, np.int64),
     )
-
-
-def _adam(steps: int) -> optax.GradientTransformation:
-    return optax.adam(optax.cosine_decay_schedule(0.1, max(steps, 1), alpha=0.1))
 
 
 def result(state: State, noise: Noise, *, whole: bool = True) -> Fit:
@@ -315,7 +308,8 @@ def _move(state: State, optimiser: Any, gradient: np.ndarray, moves: np.ndarray)
     theta = jnp.asarray(state.theta[moves])
     slope = jnp.asarray(gradient[moves], theta.dtype)
     with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-        change, kept = optimiser.update(slope, state.optimiser, theta)
+        before = jax.tree.map(jnp.asarray, state.optimiser)  # a checkpoint holds NumPy's
+        change, kept = optimiser.update(slope, before, theta)
     moved = state.theta.copy()
     moved[moves] += np.asarray(change, np.float64)
     return state._replace(theta=moved, optimiser=kept)
@@ -332,9 +326,9 @@ def _finite_mean(values: np.ndarray) -> float:
 
 def _best(state: State, whole: bool) -> int:
     """Number of the best evaluation."""
-    for losses in (state.heldout, state.loss) if whole else (state.heldout,):
-        if np.isfinite(losses).any():
-            return int(np.nanargmin(losses))
+    for found in (state.heldout, state.loss) if whole else (state.heldout,):
+        if np.isfinite(found).any():
+            return int(np.nanargmin(found))
     return int(state.step) - 1
 
 

@@ -75,10 +75,14 @@ def from_sightings(sightings: Sightings) -> Log:
 
 
 def config_of(sightings: Sequence[Sightings]) -> Config:
-    """A filter with room for all landmarks of the sightings, and for all that are seen at once."""
+    """A filter with room for all landmarks of the sightings, and for all that are seen at once.
+
+    Few landmarks that are far off turn the heading far: its linearisation is the invariant one.
+    """
     most = max(one.valid.shape[1] for one in sightings)
     count = max(len(one.names) for one in sightings)
-    return Config(landmarks=count, matches=most, fresh=most, kinds=(NODE,))
+    sizes = {"landmarks": count, "matches": most, "fresh": most}
+    return Config(kinds=(NODE,), linearisation="invariant", **sizes)
 
 
 def stack(logs: Sequence[Log]) -> Log:
@@ -107,6 +111,7 @@ def stack(logs: Sequence[Log]) -> Log:
             nodes=jax.tree.map(lambda x: fill(np.asarray(x), features), log.nodes),
             known=None if log.known is None else fill(log.known, features, -1),
             judged=fill(np.ones(len(log.truth), bool) if log.judged is None else log.judged),
+            length=np.int32(len(log.truth)),
         )
         for log in logs
     ]

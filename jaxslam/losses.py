@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.linalg import inverse_root
 from jaxslam.metrics import pose_error
@@ -80,6 +81,23 @@ def needs_truth(loss: Loss) -> bool:
     if isinstance(loss, Weighted):
         return any(needs_truth(part) for _, part in loss.parts)
     return loss in (localisation, calibrated)
+
+
+def check(loss: Loss, logs: Log, *, what: str = "logs") -> None:
+    """Raise ValueError where a loss cannot be had of runs [B], before any work starts.
+
+    Raises:
+        ValueError: There are no runs, or one has no truth and the loss needs it.
+    """
+    if not logs.motion.shape[0]:
+        raise ValueError(f"{what}: no runs to tune on")
+    if needs_truth(loss) and logs.judged is not None:
+        blind = np.flatnonzero(~np.asarray(logs.judged).any(axis=1))
+        if blind.size:
+            raise ValueError(
+                f"{what}: run {blind[0]} has no reference, which this loss needs; "
+                "give one, or use the likelihood"
+            )
 
 
 def _judged(log: Log) -> Array:

@@ -35,6 +35,7 @@ class Log(NamedTuple):
     nodes: Nodes  # [T] features of each scan
     known: Array | None = None  # (T, M) int32 landmark each feature is, -1 unknown; or match
     judged: Array | None = None  # (T,) bool, where the truth is known; everywhere unless given
+    length: Array | None = None  # () int32 steps that took place, the first ones; all unless given
 
 
 class Track(NamedTuple):
@@ -48,6 +49,7 @@ class Track(NamedTuple):
     landmarks: Array  # () int32 landmarks that count at the end
     finite: Array  # () bool
     judged: Array  # (T,) bool, where the truth is known
+    length: Array  # () int32 steps that took place
 
 
 def start(path: Array) -> Array:
@@ -174,6 +176,7 @@ def track(config: Config, noise: Noise, log: Log) -> Track:
         landmarks=jnp.sum(belief.seen >= slam.needed(config, belief.kind), dtype=jnp.int32),
         finite=jnp.all(info.finite),
         judged=jnp.ones(len(log.truth), bool) if log.judged is None else log.judged,
+        length=jnp.int32(len(log.truth)) if log.length is None else log.length,
     )
 
 
@@ -265,17 +268,16 @@ def experiment(
 def evaluate(tracks: Track) -> dict:
     """Errors over all steps whose truth is known, with the keys of `metrics.json`.
 
-    A run has diverged when its final position error exceeds 1 m or is no number; runs with
-    numbers that are none are counted there, and apart, and left out of the means. Each is listed
-    with its number, and `run_keys` of the experiment's key and that number is its own key: with it
-    `replay` does the run alone.
+    A run has diverged when its position error at the last of them exceeds 1 m or is no number;
+    runs with numbers that are none are counted there, and apart, and left out of the means. Each
+    is listed with its number, and `run_keys` of the experiment's key and that number is its own
+    key: with it `replay` does the run alone.
     """
     tracks = jax.tree.map(np.asarray, tracks)
     good = tracks.finite & np.all(np.isfinite(tracks.estimate), axis=(1, 2))
     error = np.asarray(pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth)))
     blind = np.asarray(pose_error(jnp.asarray(tracks.odometry), jnp.asarray(tracks.truth)))
-    far = ~(np.linalg.norm(_last(error, tracks.judged)[:, :2], axis=-1) <= 1.0)
-    diverged = np.flatnonzero(~good | far)
+    diverged = np.flatnonzero(~good | _far(error, tracks.judged))
     # Until the first motion the pose is certain, and NEES has no meaning.
     ratio = np.asarray(nees(jnp.asarray(error), jnp.asarray(tracks.cov)))
     certain = np.trace(tracks.cov, axis1=-2, axis2=-1) < 1e-12
@@ -283,7 +285,7 @@ def evaluate(tracks: Track) -> dict:
     use = judged & ~certain & np.isfinite(ratio)
     return {
         "runs": len(error),
-        "scans": int(error.shape[0] * error.shape[1]),
+        "scans": int(tracks.length.sum()),
         **errors(error[judged]),
         "nees": float(np.mean(ratio[use]) / 3) if use.any() else None,
         "diverged": len(diverged),
@@ -291,18 +293,17 @@ def evaluate(tracks: Track) -> dict:
         "nonfinite": int(np.sum(~good)),
         "nonfinite_runs": np.flatnonzero(~good).tolist(),
         "landmarks": float(np.mean(tracks.landmarks)),
-        "matches": float(np.mean(tracks.matches)),
+        "matches": float(tracks.matches.sum() / tracks.length.sum()),
         "dead_reckoning": errors(blind[judged])
-        | {
-            "diverged": int(np.sum(np.linalg.norm(_last(blind, tracks.judged)[:, :2], axis=-1) > 1))
-        },
+        | {"diverged": int(_far(blind, tracks.judged).sum())},
     }
 
 
-def _last(error: np.ndarray, judged: np.ndarray) -> np.ndarray:
-    """Errors (B, 3) at the last of the steps (B, T) whose truth is known, of errors (B, T, 3)."""
+def _far(error: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Runs (B,) bool with an error (B, T, 3) above 1 m at the last step (B, T) that is judged."""
     at = judged.shape[1] - 1 - np.argmax(judged[:, ::-1], axis=1)
-    return error[np.arange(len(error)), at]
+    last = error[np.arange(len(error)), at, :2]
+    return judged.any(axis=1) & ~(np.linalg.norm(last, axis=-1) <= 1.0)
 
 
 def errors(error: np.ndarray) -> dict:

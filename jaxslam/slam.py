@@ -145,20 +145,23 @@ def needed(config: Config, kind: Array) -> Array:
     return jnp.where(kind == WALL, config.wall_confirm, config.confirm)
 
 
-def _outlive(config: Config, belief: Belief, slot: Array) -> tuple[Belief, Array, Array]:
+def _outlive(
+    config: Config, belief: Belief, slot: Array, looked: Array
+) -> tuple[Belief, Array, Array]:
     """Forget what is not there, and merge two landmarks that are one.
 
     Args:
         config: Of the filter.
         belief: Updated, sightings noted.
         slot: (M,) int32 landmarks that updated it, L for none; one of them is looked at, in turn.
+        looked: () bool; a scan in which nothing at all was found says of nothing that it is gone.
 
     Returns:
         The belief, and the numbers () of forgotten and of merged landmarks.
     """
     lidar, size = config.lidar, belief.seen.size
     view = lidar.first, lidar.first + lidar.step * (lidar.beams - 1)
-    due = overdue(belief, view) & (belief.last < belief.step)
+    due = overdue(belief, view) & (belief.last < belief.step) & looked
     belief = belief._replace(missed=jnp.where(due, belief.missed + 1, belief.missed))
     confirmed = belief.seen >= needed(config, belief.kind)
     gone = ~confirmed & (belief.step - belief.last > config.patience)
@@ -220,7 +223,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     slot, used = jnp.where(finite, slot, size), used & finite
     after = note(after, seen, slot)
     if inputs.known is None:
-        after, forgotten, merged = _outlive(config, after, jnp.where(used, slot, size)[order])
+        matched = jnp.where(used, slot, size)[order]
+        after, forgotten, merged = _outlive(config, after, matched, jnp.any(seen.valid))
     else:
         forgotten = merged = jnp.int32(0)
     confirmed = after.seen >= needed(config, after.kind)

@@ -238,11 +238,13 @@ def _descend(job: Job, out: Path, options: dict[str, Any], **how: int | None) ->
         "heldout": _hash(job.test),
     }
     file, state, steps, batch = out / CHECKPOINT, None, how["steps"], how["batch"]
+    whole = batch is None or batch >= len(job.train.motion)
     if file.exists():
-        begun = fit.begin(job.noise, steps=steps, frozen=options["frozen"])
+        optimiser = fit.usual(steps, whole=whole)
+        frozen = options["frozen"]
+        begun = fit.begin(job.noise, steps=steps, frozen=frozen, optimiser=optimiser)
         state = checkpoint.read(file, begun, about)
         print(f"going on after evaluation {int(state.step)} of {steps + 1}", flush=True)
-    whole = batch is None or batch >= len(job.train.motion)
     done = 0 if state is None else int(state.step)
     bar = tqdm(total=steps + 1, initial=done, desc="compiling", mininterval=0)
 

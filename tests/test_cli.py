@@ -26,7 +26,8 @@ PICTURES = ("path.png", "errors.png")
 
 def begin(*arguments, cache):
     """Start the command line in a process of its own."""
-    own = {"XDG_CACHE_HOME": str(cache)}
+    flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")  # compiles once
+    own = {"XDG_CACHE_HOME": str(cache), "XLA_FLAGS": flags}
     keep = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     return subprocess.Popen(
         [sys.executable, "-c", FIRST_LEGS + MAIN, *map(str, arguments)],

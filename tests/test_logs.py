@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import reference_filter
 
-from jaxslam import lidar, logs, losses, sensor, slam, world
+from jaxslam import lidar, logs, losses, monte_carlo, sensor, slam, world
 from jaxslam.io import carmen
 from jaxslam.io.recording import Recording, Sightings
+from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Inputs
 from jaxslam.types import NODE
 
@@ -219,7 +220,8 @@ def test_padding_changes_nothing_of_a_drive(pair):
     assert info.used.sum() >= 4 and not padded.used[6:].any() and not padded.dof[6:].any()
     np.testing.assert_array_equal(padded.pose[6:], np.tile(padded.pose[5], (3, 1)))
     np.testing.assert_array_equal(padded.pose_cov[6:], np.tile(padded.pose_cov[5], (3, 1, 1)))
-    for a, b in zip(jax.tree.leaves(long), jax.tree.leaves(take(both, 1)), strict=True):
+    last = take(both, 1)._replace(length=None)
+    for a, b in zip(jax.tree.leaves(long), jax.tree.leaves(last), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -249,9 +251,25 @@ def test_padding_changes_nothing_of_scans(scan_log):
         assert alone != 0.0 and loss(padded, take(both, 0)) == pytest.approx(alone, rel=1e-9)
 
 
+def test_landmarks_stay_while_a_stacked_drive_stands_blind(scan_log):
+    """Which they would not, were it looking: thirty scans without what is in plain sight."""
+    log = scan_log[0]
+    still = np.zeros((30, 3), log.motion.dtype)
+    longer = Log(np.concatenate([log.truth, still]), np.concatenate([log.motion, still]), log.nodes)
+    none = jax.tree.map(lambda x: np.zeros_like(np.repeat(x[:1], 30, axis=0)), log.nodes)
+    blank = jax.tree.map(lambda *x: np.concatenate(x), log.nodes, none)
+    both = logs.stack([log, longer._replace(nodes=blank)])
+    noise = slam.log_noise()
+    alone = monte_carlo.track(CONFIG, noise, log)
+    found = monte_carlo.track(CONFIG, noise, take(both, 0))
+    assert int(alone.landmarks) > 2
+    assert int(found.landmarks) == int(alone.landmarks) and int(found.length) == len(log.truth)
+
+
 def test_stacked_padding_is_blank(pair):
     both = pair[1]
     assert not both.judged[0, 6:].any() and not both.motion[0, 6:].any()
+    assert both.length.tolist() == [6, 9]
     valid = both.nodes.valid[0]
     assert not valid[6:].any() and not valid[:, 2:].any()
     assert (both.known[0, 6:] == -1).all() and (both.known[0, :, 2:] == -1).all()

@@ -149,6 +149,7 @@ def track(final, *, finite=True, nan=False):
         landmarks=np.int32(4),
         finite=np.bool_(finite),
         judged=np.ones(2, bool),
+        length=np.int32(2),
     )
 
 
@@ -167,3 +168,22 @@ def test_evaluate_counts_diverged_and_nonfinite_runs_and_masks_the_latter():
     assert summary["dead_reckoning"]["position_rmse_m"] == pytest.approx(
         2 * summary["position_rmse_m"]
     )
+
+
+def test_steps_that_never_were_and_runs_without_truth_count_nowhere():
+    """A drive of two scans beside one of five, as `logs.stack` pads it, and one without truth."""
+    fill = lambda x: np.pad(x, [(0, 3 if x.ndim and len(x) == 2 else 0)] + [(0, 0)] * (x.ndim - 1))
+    short = track(0.2)
+    padded = jax.tree.map(lambda x: fill(np.asarray(x)) if np.ndim(x) else x, short)
+    padded.estimate[2:] = padded.estimate[1]
+    long = padded._replace(judged=np.ones(5, bool), length=np.int32(5), estimate=np.zeros((5, 3)))
+    blind = padded._replace(judged=np.zeros(5, bool), estimate=np.full((5, 3), 7.0))
+    stack = lambda *runs: monte_carlo.evaluate(jax.tree.map(lambda *x: np.stack(x), *runs))
+    alone, both = stack(short), stack(padded, blind)
+    for key in ("position_rmse_m", "heading_rmse_deg", "nees", "diverged", "matches"):
+        assert both[key] == alone[key], key
+    assert both["scans"] == 4 and both["dead_reckoning"] == alone["dead_reckoning"]
+    assert stack(padded, long)["scans"] == 7 and stack(padded, long)["matches"] == 6 / 7
+    nothing = stack(blind)
+    assert nothing["position_rmse_m"] is None and nothing["nees"] is None
+    assert nothing["diverged"] == 0

@@ -65,9 +65,10 @@ def begin(place, out, *more):
     given = ["tune", *robots[:-1], "--test", robots[-1], "--batch", ROBOTS - 2]
     given += ["--steps", STEPS, "--seed", 3, "--freeze", "wall", "--out", out, *more]
     keep = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")  # compiles once
     return subprocess.Popen(
         [sys.executable, "-c", MAIN, *map(str, given)],
-        env=keep | {"XDG_CACHE_HOME": str(place / "cache")},
+        env=keep | {"XDG_CACHE_HOME": str(place / "cache"), "XLA_FLAGS": flags},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -40,7 +40,7 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
     sure = kept("standard errors", lambda: _errors(noise_of(best["theta"]), train))
     se = np.array([np.nan if x is None else x for x in sure["relative"]])
     known = np.array(sure["identifiable"])
-    off = np.array([row["theta"] for row in rows]) - _theta(truth)
+    off = np.array([row["theta"] for row in rows]) - theta_of(truth)
     z = off[:, known] / se[known]
     ratio = np.array([row["heldout_rmse_m"] for row in rows]) / right
     return {
@@ -55,14 +55,14 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
         "identifiable": sure["identifiable"],
         "standard_errors": sure["relative"],
         "warnings": sure["warnings"],
-        "log_truth": _theta(truth),
+        "log_truth": theta_of(truth),
         "rows": rows,
     }
 
 
 def _recover(seed: int, number: int, train: Log, test: Log) -> common.Numbers:
     """Tune from a start drawn at random."""
-    truth = _theta(exact.truth())
+    truth = theta_of(exact.truth())
     reach = np.log(FACTOR)
     start = truth + np.random.default_rng([seed, number]).uniform(-reach, reach, truth.size)
     given = exact.CONFIG, train
@@ -70,7 +70,7 @@ def _recover(seed: int, number: int, train: Log, test: Log) -> common.Numbers:
     fine = fit.tune(rough.noise, *given, steps=FINE)
     return {
         "start": start,
-        "theta": _theta(fine.noise),
+        "theta": theta_of(fine.noise),
         "loss": fine.loss[fine.best],
         "skipped": int(rough.skipped.sum() + fine.skipped.sum()),
         "heldout_rmse_m": position_rmse(fine.noise, test),
@@ -93,7 +93,7 @@ def noise_of(theta: Any) -> Noise:
     return fit.constrain(unravel(jnp.asarray(theta, flat.dtype)))
 
 
-def _theta(noise: Noise) -> np.ndarray:
+def theta_of(noise: Noise) -> np.ndarray:
     """Logarithms (P,) float64 of a noise."""
     return np.log(np.asarray(ravel_pytree(noise)[0], np.float64))
 

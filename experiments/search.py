@@ -76,7 +76,7 @@ def compile_all(task: Task, loss: Loss) -> None:
     """Compile what a search runs."""
     judge(task, task.hand)
     fit.values(task.hand, task.config, task.train, loss)
-    fit.gradients(task.hand, task.config, task.train, loss)
+    fit.tune(task.hand, task.config, task.train, loss=loss, steps=1)
 
 
 def by_gradient(task: Task, loss: Loss, steps: int) -> Numbers:

@@ -8,7 +8,7 @@ gate (`MatchSpec.gate`), has no gradient, and is not tuned here.
 """
 
 from collections.abc import Callable, Collection
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -227,6 +227,7 @@ def tune(
     return result(state, noise, whole=whole)
 
 
+@cache
 def usual(steps: int, *, whole: bool) -> optax.GradientTransformation:
     """What `tune` descends by unless told.
 
@@ -308,11 +309,15 @@ def _move(state: State, optimiser: Any, gradient: np.ndarray, moves: np.ndarray)
     theta = jnp.asarray(state.theta[moves])
     slope = jnp.asarray(gradient[moves], theta.dtype)
     with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-        before = jax.tree.map(jnp.asarray, state.optimiser)  # a checkpoint holds NumPy's
-        change, kept = optimiser.update(slope, before, theta)
+        change, kept = _change(optimiser, slope, state.optimiser, theta)
     moved = state.theta.copy()
     moved[moves] += np.asarray(change, np.float64)
     return state._replace(theta=moved, optimiser=kept)
+
+
+@partial(jax.jit, static_argnums=0)
+def _change(optimiser: Any, slope: Array, state: Any, theta: Array) -> tuple[Array, Any]:
+    return optimiser.update(slope, state, theta)
 
 
 def _take(chosen: np.ndarray, x: Array) -> Array:

@@ -5,6 +5,7 @@ while the best so far is judged on the held-out runs, and programs are compiled 
 """
 
 from collections.abc import Callable
+from importlib.util import find_spec
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -130,6 +131,15 @@ def bayesian(size: int, seed: int) -> tuple[Ask, Tell]:
 
 
 METHODS = {"random": at_random, "bayesian": bayesian}
+NEEDS = {"bayesian": "optuna"}
+
+
+def methods() -> list[str]:
+    """Names of the searches whose libraries are there; tells of the others."""
+    missing = {name for name, library in NEEDS.items() if find_spec(library) is None}
+    for name in sorted(missing):
+        print(f"left out: {name}, as {NEEDS[name]} is missing; pip install '.[bench]'")
+    return [name for name in METHODS if name not in missing]
 
 
 def by_search(task: Task, method: str, seed: int, seconds: float, least: int) -> Numbers:
@@ -166,6 +176,6 @@ def time_to(trace: Numbers, error: float) -> float | None:
     return times[0] if times else None
 
 
-def part(logs: Log, chosen: slice) -> Log:
+def part(logs: Log, chosen: Any) -> Log:
     """Some of the runs."""
     return jax.tree.map(lambda x: np.asarray(x)[chosen], logs)

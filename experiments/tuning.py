@@ -8,14 +8,15 @@ goes on where it was stopped.
 
 import sys
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import jax
 import numpy as np
 
 from experiments import common, recovery, search
+from jaxslam import fit, monte_carlo, slam
 from jaxslam import logs as log_of
-from jaxslam import monte_carlo, slam
 from jaxslam.batches import use_cores
 from jaxslam.io import mrclam
 from jaxslam.io.errors import InputError
@@ -26,6 +27,7 @@ from jaxslam.options import keep_compiled
 NAME = "tuning"
 TRAIN, JUDGE = (1, 2, 3), (4, 5)  # robots of MRCLAM
 STEPS = {"office": 25, "mrclam": 40}
+STEP_RUNS = 256  # of the step that is timed
 LONGER = 10.0  # times as long as the gradient that the others search
 LANDMARKS = 64  # of the map of the office
 DATA = {"office": "office", "mrclam": "MRCLAM"}
@@ -80,7 +82,7 @@ def compare(
         run(method, loss, lambda loss=loss: search.by_gradient(task, loss, steps))
     own = traces["gradient"]
     limits = LONGER * own["seconds"], own["evaluations"]
-    for method in search.METHODS:
+    for method in search.methods():
         run(method, calibrated, lambda m=method: search.by_search(task, m, seed, *limits))
     first = own["points"][0]
     rows = [_row(data, "hand", first, 0.0, 0, own, first)]
@@ -89,6 +91,18 @@ def compare(
         within = search.best_by(trace, evaluations=own["evaluations"])
         rows.append(_row(data, method, last, *total, own, within, trace))
     return rows, traces
+
+
+def step_seconds(task: search.Task) -> common.Numbers:
+    """Seconds of one step of tuning over many runs, compiled; the training runs again and again."""
+    runs = len(task.train.motion)
+    logs = search.part(task.train, np.arange(STEP_RUNS) % runs)
+    taken = []
+    for _ in range(3):
+        begin = perf_counter()
+        fit.gradients(task.hand, task.config, logs)
+        taken.append(perf_counter() - begin)
+    return {"runs": STEP_RUNS, "scans": logs.motion.shape[1], "seconds": sorted(taken)[1]}
 
 
 def _row(
@@ -170,8 +184,11 @@ def main(argv: list[str] | None = None) -> int:
             task = recorded(Path(given.mrclam))
             tasks["mrclam"] = lambda: task
         for data, make in tasks.items():
-            more, traces[data] = compare(data, make(), given.seed, STEPS[data], kept)
+            task = make()
+            more, traces[data] = compare(data, task, given.seed, STEPS[data], kept)
             rows += more
+            if data == "office":
+                step = kept("a step", lambda task=task: step_seconds(task))
         sizes = given.starts, given.recovery_runs, given.heldout
         told = recovery.compute(given.seed, *sizes, kept)
     except InputError as error:
@@ -180,13 +197,14 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
         return 130
-    numbers = {"seed": given.seed, "rows": rows, "recovery": told, "traces": traces}
+    numbers = {"seed": given.seed, "rows": rows, "recovery": told, "step": step, "traces": traces}
     common.save(given.out, NAME, numbers, draw)
     kept.clear()
     for row in rows:
         error, nees = 100 * (row["heldout_rmse_m"] or np.nan), row["nees"] or np.nan
         name = f"{row['data']:7} {row['method']:11}"
         print(f"{name} {error:8.2f} cm  NEES {nees:7.2f}  {row['seconds']:6.0f} s")
+    print(f"a step over {step['runs']} runs of {step['scans']} scans: {step['seconds']:.1f} s")
     print({key: told[key] for key in ("starts", "within_3_se", "worst_heldout_ratio")})
     return 0
 

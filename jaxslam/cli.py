@@ -1,11 +1,10 @@
 """The command line: `jaxslam simulate`, `run LOG`, `map MAP.yaml` and `tune [LOG ...]`."""
 
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +22,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
-from jaxslam.options import keep_compiled, named, noise_of, within
+from jaxslam.options import keep_compiled, named, noise_of, stopwatch, within
 from jaxslam.slam import Config
 from jaxslam.tuning import tune
 from jaxslam.types import NODE
@@ -90,7 +89,7 @@ def simulate(
     with folder(out) as place:
         keep_compiled()
         steps = monte_carlo.drive_steps(Robot(), path)
-        with _stopwatch() as seconds:
+        with stopwatch() as seconds:
             tracks = _watch(monte_carlo.experiment(*given, runs=runs, steps=steps), runs)
         numbers = monte_carlo.evaluate(tracks) | {
             "ate_rmse_m": report.aligned_error(tracks),
@@ -147,7 +146,7 @@ def run(
     with folder(out) as place:
         keep_compiled()
         print(f"{log}: {len(wheels)} scans of {config.lidar.beams} beams", flush=True)
-        with _stopwatch() as seconds:
+        with stopwatch() as seconds:
             moved = jnp.asarray(motions, float)
             survey = slam.survey(config, assumed, jnp.zeros(3), moved, scans)
             poses = report.poses_of(survey)
@@ -220,34 +219,6 @@ def map_grid(
         report.draw_map(place / "map.png", grid, survey.graph)
         bar.update()
     report.tell_map(numbers, f"{map}: clearance {clearance:g} m, regions {survey.regions}", out)
-
-
-@contextmanager
-def _stopwatch() -> Iterator[dict[str, float]]:
-    """Seconds of the block: those of XLA's compiler, and the rest."""
-    seconds = {"compile": 0.0, "run": 0.0}
-    spans = []
-
-    def listen(event: str, duration: float, **_: Any) -> None:
-        if running and event == "/jax/core/compile/backend_compile_duration":
-            now = perf_counter()
-            spans.append((now - duration, now))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    begin, running = perf_counter(), True
-    yield seconds
-    running = False
-    seconds["compile"] = _covered(spans)
-    seconds["run"] = perf_counter() - begin - seconds["compile"]
-
-
-def _covered(spans: Iterable[tuple[float, float]]) -> float:
-    """Length of what some of the spans, from and to, cover: programs are compiled side by side."""
-    total, end = 0.0, -np.inf
-    for start, stop in sorted(spans):
-        total += max(0.0, stop - max(start, end))
-        end = max(end, stop)
-    return total
 
 
 def _watch(parts: Iterable[Track], runs: int) -> Track:

@@ -1,11 +1,14 @@
-"""What the commands share: options that are checked, errors that name them, compiled programs."""
+"""What the commands share: checked options, errors that name them, compiled programs, a clock."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import perf_counter
+from typing import Any
 
 import jax
+import numpy as np
 
 from jaxslam.io import noise as noise_file
 from jaxslam.io.errors import InputError
@@ -45,3 +48,31 @@ def keep_compiled() -> None:
     if os.access(cache, os.W_OK | os.X_OK):
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@contextmanager
+def stopwatch() -> Iterator[dict[str, float]]:
+    """Seconds of the block: those of XLA's compiler, and the rest."""
+    seconds = {"compile": 0.0, "run": 0.0}
+    spans = []
+
+    def listen(event: str, duration: float, **_: Any) -> None:
+        if running and event == "/jax/core/compile/backend_compile_duration":
+            now = perf_counter()
+            spans.append((now - duration, now))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    begin, running = perf_counter(), True
+    yield seconds
+    running = False
+    seconds["compile"] = _covered(spans)
+    seconds["run"] = perf_counter() - begin - seconds["compile"]
+
+
+def _covered(spans: Iterable[tuple[float, float]]) -> float:
+    """Length of what some of the spans, from and to, cover: programs are compiled side by side."""
+    total, end = 0.0, -np.inf
+    for start, stop in sorted(spans):
+        total += max(0.0, stop - max(start, end))
+        end = max(end, stop)
+    return total

@@ -200,8 +200,7 @@ def tell(numbers: Numbers, title: str, out: Path) -> None:
         print(f"  {'NEES / 3, about 1 if consistent':30}{numbers['nees']:9.3f}")
     print(f"  {'landmarks':30}{numbers['landmarks']:10.0f}")
     print(f"  {'matches a scan':30}{numbers['matches']:10.1f}")
-    seconds = numbers["seconds"]
-    print(f"  {'seconds':30}{seconds['run']:10.1f}, and {seconds['compile']:.1f} to compile")
+    _tell_seconds(numbers)
     print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")
 
 
@@ -247,6 +246,11 @@ def tell_map(numbers: Numbers, title: str, out: Path) -> None:
     print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, map.graphml")
 
 
+def _tell_seconds(numbers: Numbers) -> None:
+    seconds = numbers["seconds"]
+    print(f"  {'seconds':30}{seconds['run']:10.1f}, and {seconds['compile']:.1f} to compile")
+
+
 def draw_history(path: Path, found: Fit) -> None:
     """Draw how a fit went."""
     from jaxslam import plot  # matplotlib takes its time to load
@@ -278,4 +282,5 @@ def tell_tuning(numbers: Numbers, title: str, out: Path) -> None:
         print(f"  {name:30}{values[0]:12.4g}{values[1]:12.4g}{known:>18}".rstrip())
     for warning in numbers["warnings"]:
         print(f"warning: {warning}")
+    _tell_seconds(numbers)
     print(f"results: {out}{os.sep}noise.json, metrics.json, history.png")

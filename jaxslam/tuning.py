@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from time import perf_counter
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -25,7 +24,7 @@ from jaxslam.io.output import folder, write_json
 from jaxslam.losses import Loss
 from jaxslam.monte_carlo import Log
 from jaxslam.motion import Robot
-from jaxslam.options import keep_compiled, named, noise_of, within
+from jaxslam.options import keep_compiled, named, noise_of, stopwatch, within
 from jaxslam.slam import Config, Noise
 from jaxslam.world import World
 
@@ -84,7 +83,7 @@ def tune(
         loss: What is to be small: calibrated, localisation with a covariance that fits its errors;
             localisation alone, which leaves the size of the noise open; or the (negative)
             likelihood of what was observed, the only one that needs no reference.
-        steps: Updates.
+        steps: Updates: of L-BFGS, or of Adam with --batch.
         batch: Drives that each step sees, in turn; by default all.
         patience: Stop after as many judgements without a better one; by default never.
         freeze: Parameters that stay: odometry, odometry[0] ... odometry[3], range, bearing, scale,
@@ -112,15 +111,16 @@ def tune(
         within("--runs", runs, 1, 10**6)
         within("--heldout", heldout, 0, 10**6)
         make = _simulated(world, runs, heldout, noise, seed)
-    begin = perf_counter()
     with folder(out) as place:
         keep_compiled()
-        job = make()
-        options = {"loss": chosen, "frozen": freeze}
-        how = {"steps": steps, "batch": batch, "seed": seed, "patience": patience}
-        found = _descend(job, out, options, **how)
-        with _stoppable(out, lambda: "all evaluations"):
-            numbers = _judge(job, found, options) | {"seconds": perf_counter() - begin}
+        with stopwatch() as seconds:
+            job = make()
+            options = {"loss": chosen, "frozen": freeze}
+            how = {"steps": steps, "batch": batch, "seed": seed, "patience": patience}
+            found = _descend(job, out, options, **how)
+            with _stoppable(out, lambda: "all evaluations"):
+                numbers = _judge(job, found, options)
+        numbers |= {"seconds": seconds}
         noise_file.write(place / NOISE, found.noise)
         write_json(place / "metrics.json", numbers)
         report.draw_history(place / "history.png", found)

@@ -13,7 +13,7 @@ from evo.core import sync
 from evo.tools import file_interface
 
 import jaxslam
-from jaxslam import cli, geometry, lidar, metrics, world
+from jaxslam import cli, geometry, lidar, metrics, options, world
 from jaxslam.io import carmen, tum
 
 # The commands run in processes of their own, in float32 as users run them; a short drive and
@@ -277,8 +277,8 @@ def test_wrong_usage_exits_2(arguments, capsys):
 
 
 def test_what_is_compiled_side_by_side_counts_once():
-    assert cli._covered([]) == 0.0
-    assert cli._covered([(5.0, 6.0), (0.0, 2.0), (1.0, 3.0), (1.5, 2.5)]) == 4.0
+    assert options._covered([]) == 0.0
+    assert options._covered([(5.0, 6.0), (0.0, 2.0), (1.0, 3.0), (1.5, 2.5)]) == 4.0
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])

@@ -107,6 +107,16 @@ def canvas(width: float, height: float, rows: int, columns: int, widths: list[in
     return figure, figure.subplots(rows, columns, squeeze=False, width_ratios=widths)
 
 
+def plain_log(axis) -> None:
+    """Make the y axis logarithmic, with plain numbers at 1, 2 and 5 times the powers of ten."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
+
+
 def scan_of(name: str, lidar: Lidar) -> Scan:
     """Noise-free scan of the world `name` from its origin."""
     walls = jnp.asarray(world.named(name).walls, float)

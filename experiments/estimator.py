@@ -274,6 +274,7 @@ def apart(
     *,
     devices: int = 1,
     module: str = "experiments.estimator",
+    whole: bool = False,
     **arguments: Any,
 ) -> Numbers:
     """Figures of a task in a process of its own, or a note why there are none.
@@ -283,11 +284,13 @@ def apart(
         kept: Folder for what is compiled.
         devices: That JAX is to see there.
         module: That has the task.
+        whole: Whether operations stay whole; several devices always leave them so.
         arguments: Of the task.
     """
     flags = [f for f in os.environ.get("XLA_FLAGS", "").split() if not f.startswith(DEVICES)]
-    whole = [WHOLE] if devices > 1 else []
-    own = os.environ | {"XLA_FLAGS": " ".join([*flags, f"{DEVICES}={devices}", *whole])}
+    if (whole or devices > 1) and WHOLE not in flags:
+        flags.append(WHOLE)
+    own = os.environ | {"XLA_FLAGS": " ".join([*flags, f"{DEVICES}={devices}"])}
     own |= {"JAX_ENABLE_X64": "0", "JAX_COMPILATION_CACHE_DIR": kept}
     command = [sys.executable, "-m", module, task, json.dumps(arguments)]
     run = partial(subprocess.run, cwd=ROOT, capture_output=True, text=True)

@@ -162,7 +162,8 @@ def _draw_traces(axis: Any, numbers: common.Numbers, data: str, over: str) -> No
         axis.plot(x[-1], y[-1], "o", color=colour, markersize=4)
     hand = 100 * traces["gradient"]["points"][0]["heldout_rmse_m"]
     axis.axhline(hand, color=common.BLACK, linestyle=":", label="hand")
-    axis.set(xscale="log", yscale="log", ylabel="held-out position RMSE [cm]")
+    axis.set(xscale="log", ylabel="held-out position RMSE [cm]")
+    common.plain_log(axis)
     runs = "training runs, values and gradients alike" if over == "evaluations" else ""
     axis.set_xlabel("time [s]" if over == "seconds" else f"evaluations of all {runs}")
     axis.set_title(DATA[data])
@@ -181,8 +182,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         tasks = {"office": lambda: office(given.seed, given.runs, given.heldout)}
         if given.mrclam:
-            task = recorded(Path(given.mrclam))
-            tasks["mrclam"] = lambda: task
+            robots = recorded(Path(given.mrclam))
+            tasks["mrclam"] = lambda: robots
         for data, make in tasks.items():
             task = make()
             more, traces[data] = compare(data, task, given.seed, STEPS[data], kept)

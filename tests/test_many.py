@@ -295,7 +295,8 @@ def test_picture_and_numbers_are_written_and_what_was_kept_goes(done, tmp_path, 
 def test_scaling_measures_each_figure_in_its_own_process(monkeypatch):
     asked = []
 
-    def measured(task, kept, *, devices, module, **given):
+    def measured(task, kept, *, devices, module, whole, **given):
+        assert whole
         asked.append((devices, given["runs"], given["steps"], given["landmarks"]))
         return {"seconds": 3.0 / devices, "devices": devices} | given
 

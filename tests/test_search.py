@@ -174,3 +174,41 @@ def test_each_start_is_off_by_a_factor_of_its_own(monkeypatch):
     np.testing.assert_allclose(calls[1][0], told[0]["start"] + np.log(2), rtol=1e-6)
     np.testing.assert_allclose(told[0]["theta"], told[0]["start"] + np.log(4), rtol=1e-6)
     assert told[0]["loss"] == 2.0 and told[0]["skipped"] == 2
+
+
+def test_each_task_is_compared_on_its_own_runs_and_all_is_written(monkeypatch, tmp_path, capsys):
+    office, robots = TASK._replace(train="drives"), TASK._replace(train="robots")
+    compared = []
+    point = {"seconds": 1.0, "evaluations": 1, "heldout_rmse_m": 0.1, "nees": 1.0}
+    trace = {"points": [point], "seconds": 2.0, "evaluations": 3}
+
+    def compare(data, task, seed, steps, kept):
+        compared.append((data, task.train))
+        return [tuning._row(data, "hand", point, 0.0, 0, trace, point)], {"gradient": trace}
+
+    theta = recovery.theta_of(exact.truth())
+    rows = [{"start": theta + 0.1, "theta": theta}]
+    sure = {"standard_errors": [0.1] * 8, "identifiable": [True] * 7 + [False]}
+    told = {"starts": 1, "runs": 2, "within_3_se": 1, "worst_heldout_ratio": 1.0, "rows": rows}
+    told |= sure | {"names": fit.names(exact.truth()), "log_truth": theta}
+    monkeypatch.setattr(tuning, "office", lambda *_: office)
+    monkeypatch.setattr(tuning, "recorded", lambda _: robots)
+    monkeypatch.setattr(tuning, "compare", compare)
+    step = {"runs": 2, "scans": 3, "seconds": 0.5}
+    monkeypatch.setattr(tuning, "step_seconds", lambda task: step | {"of": task.train})
+    monkeypatch.setattr(recovery, "compute", lambda *_: told)
+    monkeypatch.setattr(tuning, "keep_compiled", lambda: None)
+    given = ["--out", str(tmp_path), "--mrclam", "folder"]
+    assert tuning.main(given) == 0
+    assert compared == [("office", "drives"), ("mrclam", "robots")]
+    numbers = json.loads((tmp_path / "tuning.json").read_text())
+    assert [row["data"] for row in numbers["rows"]] == ["office", "mrclam"]
+    assert numbers["step"]["of"] == "drives" and numbers["recovery"]["within_3_se"] == 1
+    assert {file.name for file in tmp_path.iterdir()} == {"tuning.json", "tuning.png"}
+    assert "NEES" in capsys.readouterr().out
+
+
+def test_a_folder_without_the_data_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tuning, "keep_compiled", lambda: None)
+    assert tuning.main(["--out", str(tmp_path / "out"), "--mrclam", str(tmp_path)]) == 2
+    assert "tuning: error: " in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -128,12 +128,15 @@ def summary(key: Any, tracks: Track) -> common.Numbers:
     error = np.asarray(metrics.pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth)))
     off = np.linalg.norm(error[..., :2], axis=-1)  # (B, T)
     told = monte_carlo.evaluate(tracks)
+    keys_of = lambda runs: np.asarray(
+        jax.random.key_data(monte_carlo.run_keys(key, jnp.asarray(runs, jnp.int32)))
+    )
+    told["diverged_keys"] = keys_of(told["diverged_runs"])
     good = np.setdiff1d(np.arange(len(off)), told["nonfinite_runs"])
     rmse = np.sqrt(np.mean(off**2, axis=1))
     if good.size == 0:
         return told | {f"p{k}_m": None for k in SHOWN} | {"worst": []}
     worst = good[np.argsort(rmse[good], kind="stable")[::-1][:WORST]]
-    keys = jax.random.key_data(monte_carlo.run_keys(key, jnp.asarray(worst, jnp.int32)))
     low, high = rmse[good].min(), rmse[good].max()
     edges = np.geomspace(0.99 * low + 1e-9, 1.01 * high + 1e-9, BINS + 1)
     return {
@@ -151,7 +154,7 @@ def summary(key: Any, tracks: Track) -> common.Numbers:
                 "truth": tracks.truth[run, :, :2],
                 "estimate": tracks.estimate[run, :, :2],
             }
-            for run, own in zip(worst, np.asarray(keys), strict=True)
+            for run, own in zip(worst, keys_of(worst), strict=True)
         ],
     }
 

@@ -11,6 +11,7 @@ import tempfile
 from io import StringIO
 from time import monotonic, sleep
 
+import jax
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from jaxslam.grid import GridSpec
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import plain
 from jaxslam.lidar import Lidar
+from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
 from jaxslam.plan import densify
 from jaxslam.types import CORNER, WALL
@@ -315,3 +317,20 @@ def test_scaling_measures_each_figure_in_its_own_process(monkeypatch):
 def test_a_module_that_has_no_such_task_is_told(tmp_path):
     done = estimator.apart("none", str(tmp_path), module="experiments.scaling")
     assert "KeyError" in done["none_note"]
+
+
+def test_runs_that_diverged_are_listed_with_their_keys():
+    key = jax.random.key(7)
+    zero = np.zeros((3, 2, 3))
+    off = zero.copy()
+    off[1, 1, 0] = 3.0
+    flags = {"finite": np.ones(3, bool), "judged": np.ones((3, 2), bool)}
+    counts = {"matches": np.zeros((3, 2), np.int32), "landmarks": np.zeros(3, np.int32)}
+    rest = {"cov": np.tile(np.eye(3), (3, 2, 1, 1)), "length": np.full(3, 2, np.int32)}
+    tracks = Track(truth=zero, estimate=off, odometry=zero, **flags, **counts, **rest)
+    told = monte_carlo.summary(key, tracks)
+    assert told["diverged_runs"] == [1]
+    own = jax.random.key_data(jax.random.fold_in(key, 1))
+    np.testing.assert_array_equal(told["diverged_keys"], [own])
+    none = monte_carlo.summary(key, tracks._replace(estimate=zero + 1e-3))
+    assert none["diverged"] == 0 and none["diverged_keys"].shape == (0, 2)

@@ -289,8 +289,8 @@ def _draw_scaling(axis: Any, told: common.Numbers, key: str, label: str) -> None
         rows = [row for row in told.get(name, []) if key in row]
         found = [row[name] for row in rows], [row[key] for row in rows]
         axis.plot(*found, style, color=colour, label=f"number of {name}")
-    axis.margins(y=0.3)
-    axis.set(xscale="log", ylabel=label, ylim=(0, None))
+    most = max((y for line in axis.lines for y in line.get_ydata()), default=1.0)
+    axis.set(xscale="log", ylabel=label, ylim=(0, 1.4 * most))
     usual = f"{scaling.RUNS} runs, {scaling.STEPS} scans, {scaling.LANDMARKS} landmarks"
     axis.set_xlabel(f"one of them varied, else {usual}")
     axis.legend()

@@ -269,6 +269,14 @@ def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return np.stack([x, y, _wrap(d[..., 2])], axis=-1)
 
 
+def chain(moves: np.ndarray) -> np.ndarray:
+    """Poses (N + 1, 3) that start at zero and move by `moves` (N, 3), each in the frame before."""
+    poses = np.zeros((len(moves) + 1, 3))
+    for i, move in enumerate(moves):
+        poses[i + 1] = _compose(poses[i], move)
+    return poses
+
+
 def _wrap(angle: np.ndarray) -> np.ndarray:
     """As `geometry.wrap_angle`, in float64."""
     return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))

@@ -13,15 +13,12 @@ from os import PathLike
 import numpy as np
 
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import Recording
+from jaxslam.io.recording import NOISE, Recording, no_return
 from jaxslam.io.text import lines, number
 from jaxslam.lidar import Lidar
 
 TOLERATED = 0.05
 """Part of the ODOM and FLASER lines that may be broken: they are left out and counted."""
-
-NOISE = 0.02
-"""Standard deviation [m] of a range; the logs do not say it."""
 
 _FORMS = {
     b"ODOM": "ODOM x y theta tv rv accel ipc_time host logger_time",
@@ -139,10 +136,7 @@ def _recording(
         problem = f"no odometry: odom_x odom_y odom_theta are the same in all {len(scans)} scans"
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
     stream = np.array(wheels) if wheels else stamped  # (N, 4)
-    ranges = np.array([ranges for _, _, ranges in scans])
-    ranges[~((ranges > 0.0) & (ranges < np.float32(reach)))] = np.inf
-    ranges = ranges.astype(np.float32)
-    ranges[ranges >= np.float32(reach)] = np.inf
+    ranges = no_return(np.array([ranges for _, _, ranges in scans]), reach)
     return Recording(
         times=stamped[:, 0].copy(),
         odometry=stamped[:, 1:].copy(),

@@ -6,7 +6,6 @@ import numpy as np
 
 from jaxslam.lidar import Lidar
 
-
 NOISE = 0.02
 """Standard deviation [m] of a range; no log says it."""
 

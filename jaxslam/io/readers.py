@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from jaxslam.io import carmen, g2o, npz
+from jaxslam.io import bags, carmen, g2o, npz
 from jaxslam.io.errors import InputError
 from jaxslam.io.recording import Recording
 from jaxslam.io.text import lines
@@ -32,7 +32,7 @@ KNOWN = {"killian": Known("rtbdata", "data", ("data", "killian.g2o.zip"))}
 
 
 def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
-    """Read a log: CARMEN's, a pose graph of g2o with scans, or a recording of `npz`.
+    """Read a log: CARMEN's, a bag of ROS, a pose graph of g2o with scans, a recording of `npz`.
 
     Args:
         path: The log, or the name of one of `KNOWN`.
@@ -68,6 +68,8 @@ def reader_of(path: Path) -> ModuleType:
     Raises:
         InputError: The file cannot be read, or no line of a known kind comes early.
     """
+    if bags.is_bag(path):
+        return bags
     if path.is_file() and _holds_arrays(path):
         return npz
     for number, text in lines(path):
@@ -77,7 +79,7 @@ def reader_of(path: Path) -> ModuleType:
         if number >= LOOK:
             break
     problem = "is no log that can be read"
-    advice = "known are CARMEN logs, pose graphs of g2o with scans, and recordings of NumPy"
+    advice = "known are CARMEN logs, ROS bags, graphs of g2o with scans, recordings of NumPy"
     raise InputError(problem, path=path, advice=advice)
 
 

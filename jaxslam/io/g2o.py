@@ -1,9 +1,7 @@
 """Pose graphs in the form of g2o that hold the laser scans of their poses, as recordings.
 
     VERTEX_SE2 id x y theta
-    ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m
-        laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side axis
-        time host logger_time
+    ROBOTLASER1 ... (`robotlaser`)
     EDGE_SE2 from to x y theta (6 numbers of the information matrix)
 
 A scan belongs to the vertex before it. Edges from one vertex to the next one in the file are the
@@ -13,12 +11,13 @@ odometry; all others are left to whoever closes loops. Places of the vertices ar
 import math
 from collections import Counter
 from os import PathLike
-from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
 from jaxslam.io.recording import NOISE, Recording, no_return
+from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
 from jaxslam.lidar import Lidar
 from jaxslam.metrics import chain
@@ -28,22 +27,9 @@ TOLERATED = 0.05
 
 _FORMS = {
     b"VERTEX_SE2": "VERTEX_SE2 id x y theta",
-    b"ROBOTLASER1": "ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 "
-    ".. s_m, 3 numbers of the laser's pose, 3 of the robot's, tv rv forward side axis time host "
-    "logger_time",
+    b"ROBOTLASER1": robotlaser.FORM,
     b"EDGE_SE2": "EDGE_SE2 from to x y theta and 6 numbers of the information matrix",
 }
-
-
-class _Laser(NamedTuple):
-    """A scan, and the line that it stands in."""
-
-    line: int
-    time: float  # [s]
-    first: float  # [rad]
-    step: float  # [rad]
-    reach: float  # [m]
-    ranges: np.ndarray  # (R,) float64 [m]
 
 
 def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
@@ -61,7 +47,7 @@ def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
     if not 0.0 < reach < math.inf:
         raise InputError(f"reach {reach} m", advice="give a positive number of metres")
     order: list[int] = []  # names of the vertices as they come
-    scans: dict[int, _Laser] = {}
+    scans: dict[int, Laser] = {}
     edges: dict[tuple[int, int], tuple[float, ...]] = {}
     broken: dict[int, str] = {}
     for line, text in lines(path):
@@ -76,7 +62,7 @@ def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
                 pair = _name(fields, 12, 1), _name(fields, 12, 2)
                 edges.setdefault(pair, tuple(number(x, "x y theta") for x in fields[3:6]))
             elif order:
-                scans.setdefault(order[-1], _scan(line, fields))
+                scans.setdefault(order[-1], robotlaser.parse(line, fields))
         except InputError as error:
             if kind != b"ROBOTLASER1":
                 advice = f"repair it, it is: {_FORMS[kind]}"
@@ -88,7 +74,7 @@ def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
     if len(set(order)) < len(order):
         twice = Counter(order).most_common(1)[0][0]
         raise InputError(f"vertex {twice} comes twice", path=path, advice="number them anew")
-    scans, odd = _alike(scans)
+    scans, odd = robotlaser.alike(scans)
     broken |= odd
     _check(path, scans, broken)
     return _recording(path, order, scans, edges, len(broken), reach)
@@ -104,41 +90,7 @@ def _name(fields: list[bytes], count: int, at: int) -> int:
     return int(value)
 
 
-def _scan(line: int, fields: list[bytes]) -> _Laser:
-    """A ROBOTLASER1 line; errors do not know the place."""
-    if len(fields) < 9:
-        raise InputError(f"cut or damaged: {len(fields)} fields")
-    n = number(fields[8], "field 9 (n)")
-    if n < 2 or n != int(n):
-        raise InputError(f"{n:g} is no number of beams", field="field 9 (n)")
-    n = int(n)
-    m = number(fields[9 + n], f"field {10 + n} (m)") if len(fields) > 9 + n else 0.0
-    right = 24 + n + m
-    if len(fields) != right:
-        raise InputError(f"cut or damaged: {len(fields)} fields instead of {right:g}")
-    first, step, most = (number(fields[i], f"field {i + 1}") for i in (2, 4, 5))
-    if not 0.0 < step <= math.pi or not 0.0 < most:
-        raise InputError("step or greatest range is not positive", field="fields 5 and 6")
-    try:
-        ranges = np.array([float(field) for field in fields[9 : 9 + n]])
-    except ValueError:
-        raise InputError("a range is not a number") from None
-    if np.isnan(ranges).any():
-        raise InputError("a range is not a number")
-    return _Laser(line, number(fields[-3], "time"), first, step, most, ranges)
-
-
-def _alike(scans: dict[int, _Laser]) -> tuple[dict[int, _Laser], dict[int, str]]:
-    """Scans with the most frequent scanner, and what is wrong with the others by line."""
-    if not scans:
-        return scans, {}
-    scanner = lambda one: (one.first, one.step, one.reach, one.ranges.size)
-    usual = Counter(map(scanner, scans.values())).most_common(1)[0][0]
-    odd = {one.line: "another scanner" for one in scans.values() if scanner(one) != usual}
-    return {name: one for name, one in scans.items() if one.line not in odd}, odd
-
-
-def _check(path: str | PathLike, scans: dict[int, _Laser], broken: dict[int, str]) -> None:
+def _check(path: str | PathLike, scans: dict[int, Laser], broken: dict[int, str]) -> None:
     """Raise if there are no scans, or more are broken than is tolerated."""
     total = len(scans) + len(broken)
     if not total:
@@ -154,7 +106,7 @@ def _check(path: str | PathLike, scans: dict[int, _Laser], broken: dict[int, str
 def _recording(
     path: str | PathLike,
     order: list[int],
-    scans: dict[int, _Laser],
+    scans: dict[int, Laser],
     edges: dict[tuple[int, int], tuple[float, ...]],
     skipped: int,
     reach: float,

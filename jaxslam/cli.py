@@ -16,7 +16,7 @@ import jaxslam
 from jaxslam import lidar, metrics, monte_carlo, plan, report, skeleton, slam
 from jaxslam import world as worlds
 from jaxslam.batches import use_cores
-from jaxslam.io import carmen, graphml, occupancy, tum
+from jaxslam.io import graphml, occupancy, readers, tum
 from jaxslam.io import relations as relations_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
@@ -125,13 +125,15 @@ def run(
     made at the origin of the map.
 
     Args:
-        log: CARMEN log with FLASER lines, plain or gzipped.
+        log: CARMEN log with FLASER lines, pose graph of g2o with its scans, each plain, gzipped or
+            alone in a zip archive; or a recording as a NumPy file. `killian` names the log of the
+            extra [data].
         reference: Trajectory to compare with, a TUM file on the log's clock.
         relations: Verified relative poses to compare with, on the log's clock.
         noise: File of the noise that the filter assumes; by default a cautious one.
         out: Folder for the results.
     """
-    recording = carmen.read(log)
+    recording = readers.read(log)
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
     assumed = noise_of(noise, slam.log_noise())

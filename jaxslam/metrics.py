@@ -107,7 +107,7 @@ def align(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
     angle = np.arctan2(
         np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
     )
-    turned = _compose(np.array([0.0, 0.0, angle]), np.append(centre, 0.0))
+    turned = composed(np.array([0.0, 0.0, angle]), np.append(centre, 0.0))
     return np.append(goal - turned[:2], angle)
 
 
@@ -167,7 +167,7 @@ def ate(
         raise ValueError(f"{len(pairs)} times agree within {tolerance} s; are the clocks the same?")
     points = np.asarray(poses, np.float64)[pairs[:, 0]]
     goals = np.asarray(ref_poses, np.float64)[pairs[:, 1], :2]
-    moved = _compose(align(points[:, :2], goals), points)
+    moved = composed(align(points[:, :2], goals), points)
     distance = np.linalg.norm(moved[:, :2] - goals, axis=1)
     return {"ate_rmse_m": float(np.sqrt(np.mean(distance**2))), "matched": len(pairs)}
 
@@ -234,8 +234,8 @@ def _pose_at(
     times, poses = _by_time(times, poses)
     last = np.searchsorted(times, wanted + slack, side="right") - 1
     wheels = _by_time(wheel_times, wheel_poses)
-    moved = seen_from(_interpolate(times[last], *wheels), _interpolate(wanted, *wheels))
-    return _compose(poses[last], moved)
+    moved = seen_from(interpolate(times[last], *wheels), interpolate(wanted, *wheels))
+    return composed(poses[last], moved)
 
 
 def _by_time(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -244,13 +244,13 @@ def _by_time(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.asarray(times, np.float64)[order], np.asarray(poses, np.float64)[order]
 
 
-def _interpolate(wanted: np.ndarray, times: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def interpolate(wanted: np.ndarray, times: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Poses (K, 3) at times (K,), linearly between those of (N,) sorted times."""
     columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
     return np.stack([np.interp(wanted, times, column) for column in columns], axis=-1)
 
 
-def _compose(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
+def composed(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """As `geometry.compose`, for (..., 3) in float64 whatever JAX's precision."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = pose[..., 0] + c * motion[..., 0] - s * motion[..., 1]
@@ -267,6 +267,14 @@ def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
     d = poses - frames
     x, y = c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]
     return np.stack([x, y, _wrap(d[..., 2])], axis=-1)
+
+
+def chain(moves: np.ndarray) -> np.ndarray:
+    """Poses (N + 1, 3) that start at zero and move by `moves` (N, 3), each in the frame before."""
+    poses = np.zeros((len(moves) + 1, 3))
+    for i, move in enumerate(moves):
+        poses[i + 1] = composed(poses[i], move)
+    return poses
 
 
 def _wrap(angle: np.ndarray) -> np.ndarray:

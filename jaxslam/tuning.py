@@ -17,7 +17,7 @@ from jaxslam import curvature, fit, losses, metrics, monte_carlo, plan, report, 
 from jaxslam import logs as log_of
 from jaxslam import world as worlds
 from jaxslam.batches import use_cores
-from jaxslam.io import carmen, checkpoint, mrclam, tum
+from jaxslam.io import checkpoint, mrclam, readers, tum
 from jaxslam.io import noise as noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
@@ -182,7 +182,7 @@ def _recorded(
         advice = "use --loss likelihood"
     else:
         start = noise_of(noise, slam.log_noise())
-        every = [carmen.read(path) for path in (*logs, *test)]
+        every = [readers.read(path) for path in (*logs, *test)]
         if reference and len(reference) != len(every):
             problem = f"{len(reference)} files for {len(every)} logs"
             raise InputError(problem, field="--reference", advice="give one for each log, in order")

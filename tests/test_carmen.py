@@ -126,7 +126,7 @@ def test_one_broken_line_is_skipped_and_too_many_are_named(tmp_path, line, reaso
     assert np.isfinite(log.odometry).all() and np.isfinite(log.ranges).all()
     text = complaint(save(tmp_path / "b.clf", ["# first", *lines[:8]]))
     assert text.startswith(f"{tmp_path / 'b.clf'}:8: ") and reason in text
-    assert "(1 of 8 FLASER and ODOM lines are broken)" in text
+    assert "(1 of 8 lines of scans and odometry are broken)" in text
     assert "; repair them, each is: " + line.split()[0] + " " in text
 
 
@@ -231,3 +231,39 @@ def test_recorded_logs(shared_data, name, scans, beams, wheels, none):
     seen = np.isfinite(log.ranges)
     np.testing.assert_allclose(log.ranges[seen], raw[seen], rtol=1e-6)
     np.testing.assert_array_equal(log.odometry[:, 2], [float(line[-4]) for line in lines])
+
+
+def robotlaser(t, pose=(1.0, 2.0, 0.5), ranges=(1, 2, 30, 4), step=0.5):
+    beams = " ".join(map(str, ranges))
+    poses = f"{pose[0]} {pose[1]} {pose[2]} 9 9 9"
+    head = f"ROBOTLASER1 0 -0.75 2.0 {step} 8.0 0.01 0 {len(ranges)} {beams} 0"
+    return f"{head} {poses} 0.1 0.2 0.3 0.4 1e6 {t} host {t}"
+
+
+def test_scans_of_the_newer_toolkit_are_read(tmp_path):
+    lines = [robotlaser(t, pose=(0.1 * t, 0.0, 0.2)) for t in range(5)]
+    log = carmen.read(save(tmp_path / "a.clf", lines))
+    assert log.lidar == lidar_of(4, -0.75, 0.5, 8.0)
+    np.testing.assert_array_equal(log.ranges[0], [1, 2, np.inf, 4])
+    np.testing.assert_allclose(log.odometry[:, 0], 0.1 * np.arange(5))
+    np.testing.assert_array_equal(log.wheel_times, np.arange(5))
+    assert carmen.read(tmp_path / "a.clf", reach=3.0).lidar.reach == 3.0
+
+
+def lidar_of(*numbers):
+    return carmen.Lidar(*numbers, carmen.NOISE)
+
+
+def test_scans_that_are_there_twice_count_once(tmp_path):
+    lines = [line for t in range(5) for line in (flaser(t), robotlaser(t), "ROBOTLASER1 cut")]
+    log = carmen.read(save(tmp_path / "a.clf", lines))
+    assert len(log.times) == 5 and log.skipped == 0 and log.lidar.first == -np.pi / 2
+
+
+def test_broken_scans_of_the_newer_toolkit_are_told(tmp_path):
+    good = [robotlaser(t, pose=(t, 0, 0)) for t in range(40)]
+    lines = [*good, robotlaser(50, step=0.4)]
+    assert carmen.read(save(tmp_path / "a.clf", lines)).skipped == 1
+    text = complaint(save(tmp_path / "b.clf", [*good[:3], "ROBOTLASER1 0 1 2"]))
+    assert ":4: cut or damaged: 4 fields (1 of 4" in text and "ROBOTLASER1 type first" in text
+    assert "no odometry" in complaint(save(tmp_path / "c.clf", [robotlaser(t) for t in range(4)]))

@@ -1,4 +1,5 @@
 import io
+import os
 import pickle
 from typing import NamedTuple
 
@@ -94,9 +95,7 @@ def half(file, **_):
     full()
 
 
-@pytest.mark.parametrize(
-    "module, name, fails", [(np, "savez", half), (checkpoint.os, "fsync", full)]
-)
+@pytest.mark.parametrize("module, name, fails", [(np, "savez", half), (os, "fsync", full)])
 def test_a_failure_while_writing_leaves_the_old_state(kept, monkeypatch, module, name, fails):
     with monkeypatch.context() as patch:
         patch.setattr(module, name, fails)
@@ -111,7 +110,7 @@ def test_a_stop_while_writing_leaves_the_old_state(kept, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoint.os, "replace", stop)
+    monkeypatch.setattr(os, "replace", stop)
     with pytest.raises(KeyboardInterrupt):
         checkpoint.write(kept, state(seed=1), ABOUT)
     check_equal(checkpoint.read(kept, state(), ABOUT), state())

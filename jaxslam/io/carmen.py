@@ -2,8 +2,10 @@
 
     ODOM x y theta tv rv accel ipc_time host logger_time
     FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_time host logger_time
+    ROBOTLASER1 ... (`robotlaser`)
 
-All other messages and comments are passed over.
+All other messages and comments are passed over, and ROBOTLASER1 too where there is FLASER, which
+then holds the same scans. Poses of ROBOTLASER1 are those of the laser.
 """
 
 import math
@@ -12,19 +14,19 @@ from os import PathLike
 
 import numpy as np
 
+from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import Recording
+from jaxslam.io.recording import NOISE, Recording, no_return
+from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
 from jaxslam.lidar import Lidar
 
 TOLERATED = 0.05
 """Part of the ODOM and FLASER lines that may be broken: they are left out and counted."""
 
-NOISE = 0.02
-"""Standard deviation [m] of a range; the logs do not say it."""
-
 _FORMS = {
     b"ODOM": "ODOM x y theta tv rv accel ipc_time host logger_time",
+    b"ROBOTLASER1": robotlaser.FORM,
     b"FLASER": "FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_time host logger_time",
 }
 
@@ -43,6 +45,7 @@ def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
     if not 0.0 < reach < math.inf:
         raise InputError(f"reach {reach} m", advice="give a positive number of metres")
     wheels, scans, broken = [], [], {}
+    lasers: dict[int, Laser] = {}
     for line, text in lines(path):
         fields = text.split()
         kind = fields[0] if fields else b""
@@ -51,8 +54,18 @@ def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
                 wheels.append(_odom(fields))
             elif kind == b"FLASER":
                 scans.append((line, *_flaser(fields)))
+            elif kind == b"ROBOTLASER1":
+                lasers[line] = robotlaser.parse(line, fields)
         except InputError as error:
             broken[line] = kind, str(error)
+    newer = bool(lasers) and not scans
+    unused = b"FLASER" if newer else b"ROBOTLASER1"
+    broken = {line: one for line, one in broken.items() if one[0] != unused}
+    if newer:
+        lasers, odd = robotlaser.alike(lasers)
+        broken |= {line: (b"ROBOTLASER1", problem) for line, problem in odd.items()}
+        _check_broken(path, broken, len(wheels) + len(lasers) + len(broken))
+        return _newer(path, wheels, list(lasers.values()), len(broken), reach)
     if not wheels and not scans and not broken:
         advice = "name a CARMEN log; other formats have other readers"
         raise InputError("has neither FLASER nor ODOM lines", path=path, advice=advice)
@@ -125,7 +138,7 @@ def _check_broken(path: str | PathLike, broken: dict, total: int) -> None:
         return
     line = min(broken)
     kind, reason = broken[line]
-    problem = f"{reason} ({len(broken)} of {total} FLASER and ODOM lines are broken)"
+    problem = f"{reason} ({len(broken)} of {total} lines of scans and odometry are broken)"
     advice = f"repair them, each is: {_FORMS[kind]}"
     raise InputError(problem, path=path, line=line, advice=advice)
 
@@ -135,19 +148,41 @@ def _recording(
 ) -> Recording:
     """Stack the lines' values; readings that are no return become inf."""
     stamped = np.array([stamp for _, stamp, _ in scans])  # (T, 4)
-    if len(scans) > 1 and not np.ptp(stamped[:, 1:], axis=0).any():
-        problem = f"no odometry: odom_x odom_y odom_theta are the same in all {len(scans)} scans"
+    ranges = no_return(np.array([ranges for _, _, ranges in scans]), reach)
+    lidar = layout(ranges.shape[1], reach)
+    return _joined(path, wheels, stamped, ranges, lidar, skipped)
+
+
+def _newer(
+    path: str | PathLike, wheels: list, scans: list[Laser], skipped: int, reach: float
+) -> Recording:
+    """The same of ROBOTLASER1 lines."""
+    stamped = np.array([(one.time, *one.pose) for one in scans])
+    first = scans[0]
+    reach = min(reach, first.reach)
+    ranges = no_return(np.array([one.ranges for one in scans]), reach)
+    lidar = Lidar(ranges.shape[1], first.first, first.step, reach, NOISE)
+    return _joined(path, wheels, stamped, ranges, lidar, skipped)
+
+
+def _joined(
+    path: str | PathLike,
+    wheels: list,
+    stamped: np.ndarray,
+    ranges: np.ndarray,
+    lidar: Lidar,
+    skipped: int,
+) -> Recording:
+    """Scans (T, R) with their times and poses (T, 4), and the stream of the wheels."""
+    if len(stamped) > 1 and not np.ptp(stamped[:, 1:], axis=0).any():
+        problem = f"no odometry: its pose is the same in all {len(stamped)} scans"
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
     stream = np.array(wheels) if wheels else stamped  # (N, 4)
-    ranges = np.array([ranges for _, _, ranges in scans])
-    ranges[~((ranges > 0.0) & (ranges < np.float32(reach)))] = np.inf
-    ranges = ranges.astype(np.float32)
-    ranges[ranges >= np.float32(reach)] = np.inf
     return Recording(
         times=stamped[:, 0].copy(),
         odometry=stamped[:, 1:].copy(),
         ranges=ranges,
-        lidar=layout(ranges.shape[1], reach),
+        lidar=lidar,
         skipped=skipped,
         wheel_times=stream[:, 0].copy(),
         wheel_poses=stream[:, 1:].copy(),

@@ -1,17 +1,15 @@
 """A long computation's state in a file, so that it can go on after any stop."""
 
 import json
-import os
 from collections.abc import Mapping
 from os import PathLike
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from jaxslam.io.errors import InputError
-from jaxslam.io.output import plain
+from jaxslam.io.output import plain, replace
 
 Tree = TypeVar("Tree")
 ABOUT = "about"
@@ -28,22 +26,9 @@ def write(path: str | PathLike, state: Any, about: Mapping[str, Any]) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    path = Path(path)
     leaves = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, **{ABOUT: json.dumps(plain(about))}, **leaves)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        advice = "name a folder that exists and that you may write to"
-        raise InputError(
-            f"cannot be written ({error.strerror})", path=path, advice=advice
-        ) from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replace(path) as file:
+        np.savez(file, **{ABOUT: json.dumps(plain(about))}, **leaves)
 
 
 def read(path: str | PathLike, template: Tree, about: Mapping[str, Any]) -> Tree:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -64,6 +64,30 @@ def _move_files(source: Path, target: Path) -> None:
         raise _cannot_write(target, error) from None
 
 
+@contextmanager
+def replace(path: str | PathLike) -> Iterator[IO[bytes]]:
+    """A file to write to, which takes the place of `path` when the block has ended well.
+
+    Args:
+        path: Its folder must exist. What was there stays if the block raises.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _cannot_write(path, error) from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def write_text(path: str | PathLike, text: str) -> None:
     """Write a text file; it appears whole or not at all.
 
@@ -74,15 +98,8 @@ def write_text(path: str | PathLike, text: str) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise _cannot_write(path, error) from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replace(path) as file:
+        file.write(text.encode("utf-8"))
 
 
 def write_json(path: str | PathLike, value: Any) -> None:

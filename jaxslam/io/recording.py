@@ -6,6 +6,9 @@ import numpy as np
 
 from jaxslam.lidar import Lidar
 
+NOISE = 0.02
+"""Standard deviation [m] of a range; no log says it."""
+
 
 class Recording(NamedTuple):
     """A recorded drive of T scans of R beams, in file order: time stamps may run backwards.
@@ -40,3 +43,12 @@ class Sightings(NamedTuple):
     places: np.ndarray  # (L, 2) float64 [m] reference positions of the landmarks, world frame
     names: np.ndarray  # (L,) int32 what the recording calls them
     skipped: int  # measurements left out
+
+
+def no_return(ranges: np.ndarray, reach: float) -> np.ndarray:
+    """Ranges [m] as float32, infinite where they are not above zero or not below `reach`."""
+    ranges = ranges.copy()
+    ranges[~((ranges > 0.0) & (ranges < np.float32(reach)))] = np.inf
+    ranges = ranges.astype(np.float32)
+    ranges[ranges >= np.float32(reach)] = np.inf
+    return ranges

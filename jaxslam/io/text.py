@@ -1,11 +1,14 @@
-"""Lines and numbers of text files, plain or gzipped; their errors say where."""
+"""Lines and numbers of text files, plain or packed; their errors say where."""
 
 import gzip
 import math
+import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -16,18 +19,17 @@ def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
     """Yield each line of a text file with its number, counted from 1.
 
     Args:
-        path: Text file; a gzipped one is unpacked on the way.
+        path: Text file; a gzipped one, or the only one in a zip archive, is unpacked on the way.
 
     Raises:
-        InputError: The file is missing, a folder, unreadable, empty, binary or a damaged gzip.
+        InputError: The file is missing, a folder, unreadable, empty, binary or damaged where it is
+            packed; an archive holds several.
     """
     path = Path(path)
     if path.is_dir():
         raise InputError("is a folder", path=path, advice="name a file inside it")
     try:
-        with open(path, "rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        with gzip.open(path, "rb") if packed else open(path, "rb") as file:
+        with _open(path) as file:
             head = file.read(4096)
             if not head.strip():
                 raise InputError("is empty", path=path, advice="name a file with content")
@@ -42,10 +44,36 @@ def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
         raise InputError(
             f"is a damaged gzip file ({error})", path=path, advice="copy it again"
         ) from None
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+        raise InputError(
+            f"is a zip archive that cannot be read ({error})", path=path, advice="unpack it"
+        ) from None
     except OSError as error:
         raise InputError(
             f"cannot be read ({error.strerror})", path=path, advice="check its permissions"
         ) from None
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[IO[bytes]]:
+    """A file's content, unpacked."""
+    with open(path, "rb") as file:
+        head = file.read(4)
+    if head[:2] == b"\x1f\x8b":
+        with gzip.open(path, "rb") as file:
+            yield file
+    elif head == b"PK\3\4":
+        with zipfile.ZipFile(path) as archive:
+            names = [one for one in archive.namelist() if not one.endswith("/")]
+            names = [one for one in names if not one.startswith("__MACOSX/")]
+            if len(names) != 1:
+                problem = f"is a zip archive of {len(names)} files"
+                raise InputError(problem, path=path, advice="unpack it and name one of them")
+            with archive.open(names[0]) as file:
+                yield file
+    else:
+        with open(path, "rb") as file:
+            yield file
 
 
 def number(field: bytes, name: str) -> float:

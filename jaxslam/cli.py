@@ -125,9 +125,8 @@ def run(
     made at the origin of the map.
 
     Args:
-        log: CARMEN log with FLASER lines, pose graph of g2o with its scans, each plain, gzipped or
-            alone in a zip archive; or a recording as a NumPy file. `killian` names the log of the
-            extra [data].
+        log: CARMEN log, ROS bag, pose graph of g2o with its scans, or recording as a NumPy file;
+            `killian` is the log that the extra [data] brings.
         reference: Trajectory to compare with, a TUM file on the log's clock.
         relations: Verified relative poses to compare with, on the log's clock.
         noise: File of the noise that the filter assumes; by default a cautious one.

@@ -72,11 +72,11 @@ def tune(
     not tuned.
 
     Args:
-        logs: CARMEN logs with FLASER lines, or folders of MRCLAM data sets (FOLDER for all of its
-            robots, FOLDER/Robot2 for one); none: simulated drives.
+        logs: Logs of laser scans, as `jaxslam run` takes them, or folders of MRCLAM data sets
+            (FOLDER for all of its robots, FOLDER/Robot2 for one); none: simulated drives.
         test: Logs to judge by, which nothing is tuned on.
-        reference: A TUM file for each CARMEN log, first of those to tune on, then of --test; MRCLAM
-            data sets bring their own.
+        reference: A TUM file for each log of scans, first of those to tune on, then of --test;
+            MRCLAM data sets bring their own.
         world: Where simulated drives are.
         runs: Simulated drives to tune on.
         heldout: And to judge by.
@@ -164,7 +164,7 @@ def _recorded(
     groups = [[_robots(path) for path in some] for some in (logs, test)]
     named_ones = {found is not None for some in groups for found in some}
     if len(named_ones) > 1:
-        raise InputError("CARMEN logs and MRCLAM data sets are tuned apart", field="LOG")
+        raise InputError("logs of scans and MRCLAM data sets are tuned apart", field="LOG")
     if named_ones == {True}:
         if reference:
             raise InputError("MRCLAM data sets bring their own", field="--reference")

@@ -18,8 +18,8 @@ from jaxslam.monte_carlo import Log
 from jaxslam.slam import Noise
 
 FACTOR = 5.0
-PACK = 32  # runs of a step at first
-ROUGH, FINE = 40, 15  # steps with some of the runs, then with all
+PACK, SOME = 32, 64  # runs of a step at first, then
+ROUGH, MIDDLE, FINE = 40, 20, 12  # steps with these, and then with all
 
 
 def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) -> common.Numbers:
@@ -65,14 +65,14 @@ def _recover(seed: int, number: int, train: Log, test: Log) -> common.Numbers:
     truth = theta_of(exact.truth())
     reach = np.log(FACTOR)
     start = truth + np.random.default_rng([seed, number]).uniform(-reach, reach, truth.size)
-    given = exact.CONFIG, train
-    rough = fit.tune(noise_of(start), *given, steps=ROUGH, batch=PACK, seed=number)
-    fine = fit.tune(rough.noise, *given, steps=FINE)
+    rough = fit.tune(noise_of(start), exact.CONFIG, train, steps=ROUGH, batch=PACK, seed=number)
+    near = fit.tune(rough.noise, exact.CONFIG, _part(train, slice(SOME)), steps=MIDDLE)
+    fine = fit.tune(near.noise, exact.CONFIG, train, steps=FINE)
     return {
         "start": start,
         "theta": theta_of(fine.noise),
         "loss": fine.loss[fine.best],
-        "skipped": int(rough.skipped.sum() + fine.skipped.sum()),
+        "skipped": int(sum(one.skipped.sum() for one in (rough, near, fine))),
         "heldout_rmse_m": position_rmse(fine.noise, test),
     }
 

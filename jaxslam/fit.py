@@ -8,7 +8,7 @@ gate (`MatchSpec.gate`), has no gradient, and is not tuned here.
 """
 
 from collections.abc import Callable, Collection
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,15 +19,13 @@ from jax.flatten_util import ravel_pytree
 
 from jaxslam import losses, slam
 from jaxslam.batches import Spread
+from jaxslam.descent import usual
 from jaxslam.losses import Loss, calibrated
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array
 
 GROUP = 4  # runs that a device differentiates together; bounds memory
-MEMORY = 10  # steps that L-BFGS remembers
-REACH = 0.4  # by which one of them changes a logarithm at most
-RATE = 0.2  # first step of Adam
 
 
 class State(NamedTuple):
@@ -177,7 +175,7 @@ def tune(
         logs: [B] training runs.
         loss: Mean of this over runs is made small; one of `losses`, or any function of the info
             of a filtered run and its log.
-        optimiser: Of the logarithms of the free parameters; that of `usual` unless given.
+        optimiser: Of the logarithms of the free parameters; `descent.usual` unless given.
         steps: Number of updates.
         batch: Runs a step, in turn from a shuffled pack; all of them unless given.
         seed: Of that shuffle.
@@ -207,6 +205,7 @@ def tune(
     moves, runs = free(noise, frozen), logs.motion.shape[0]
     whole = batch is None or batch >= runs
     optimiser = usual(steps, whole=whole) if optimiser is None else optimiser
+    optimiser = optax.with_extra_args_support(optimiser)
     if state is None:
         state = begin(noise, steps=steps, frozen=frozen, optimiser=optimiser)
     noise_of = lambda theta: constrain(unravel(jnp.asarray(theta, start.dtype)))
@@ -221,25 +220,10 @@ def tune(
         if heldout is not None and (step % every == 0 or step == steps):
             judged = _finite_mean(values(now, config, heldout, loss))
         state = _note(state, value, judged, bad)
-        state = _move(state, optimiser, gradient, moves)
+        state = _move(state, optimiser, value, gradient, moves)
         if report is not None:
             report(state)
     return result(state, noise, whole=whole)
-
-
-@cache
-def usual(steps: int, *, whole: bool) -> optax.GradientTransformation:
-    """What `tune` descends by unless told.
-
-    Where all runs are seen in each step, the gradients of some steps compare: L-BFGS, which finds
-    its way along the narrow valleys between parameters that do nearly the same. It takes its steps
-    without a line search, and none changes a logarithm by more than `REACH`. Else Adam, with a step
-    that decays to a tenth.
-    """
-    if whole:
-        newton = optax.scale_by_lbfgs(memory_size=MEMORY)
-        return optax.chain(newton, optax.clip(REACH), optax.scale(-1.0))
-    return optax.adam(optax.cosine_decay_schedule(RATE, max(steps, 1), alpha=0.1))
 
 
 def begin(
@@ -304,20 +288,25 @@ def _note(state: State, value: float, judged: float, bad: int) -> State:
     )
 
 
-def _move(state: State, optimiser: Any, gradient: np.ndarray, moves: np.ndarray) -> State:
+def _move(
+    state: State, optimiser: Any, value: float, gradient: np.ndarray, moves: np.ndarray
+) -> State:
     """Update the free parameters."""
     theta = jnp.asarray(state.theta[moves])
     slope = jnp.asarray(gradient[moves], theta.dtype)
     with jax.numpy_dtype_promotion("standard"):  # optax asks for it
-        change, kept = _change(optimiser, slope, state.optimiser, theta)
+        loss = jnp.asarray(value, theta.dtype)
+        change, kept = _change(optimiser, slope, state.optimiser, theta, loss)
     moved = state.theta.copy()
     moved[moves] += np.asarray(change, np.float64)
     return state._replace(theta=moved, optimiser=kept)
 
 
 @partial(jax.jit, static_argnums=0)
-def _change(optimiser: Any, slope: Array, state: Any, theta: Array) -> tuple[Array, Any]:
-    return optimiser.update(slope, state, theta)
+def _change(
+    optimiser: Any, slope: Array, state: Any, theta: Array, value: Array
+) -> tuple[Array, Any]:
+    return optimiser.update(slope, state, theta, value=value)
 
 
 def _take(chosen: np.ndarray, x: Array) -> Array:

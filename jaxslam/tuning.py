@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam import curvature, fit, losses, metrics, monte_carlo, plan, report, slam
+from jaxslam import curvature, descent, fit, losses, metrics, monte_carlo, plan, report, slam
 from jaxslam import logs as log_of
 from jaxslam import world as worlds
 from jaxslam.batches import use_cores
@@ -240,7 +240,7 @@ def _descend(job: Job, out: Path, options: dict[str, Any], **how: int | None) ->
     file, state, steps, batch = out / CHECKPOINT, None, how["steps"], how["batch"]
     whole = batch is None or batch >= len(job.train.motion)
     if file.exists():
-        optimiser = fit.usual(steps, whole=whole)
+        optimiser = descent.usual(steps, whole=whole)
         frozen = options["frozen"]
         begun = fit.begin(job.noise, steps=steps, frozen=frozen, optimiser=optimiser)
         state = checkpoint.read(file, begun, about)

@@ -10,7 +10,7 @@ ORDER = (
     "types linalg batches geometry world motion lidar grid voronoi tiles lines edges global_edges "
     "circles nodes sensor noise junctions links alignment association belief conditioning ekf "
     "recognition arrow ways topomap medial skeleton slam smoother plan metrics monte_carlo "
-    "losses fit curvature io logs plot report options tuning cli"
+    "losses descent fit curvature io logs plot report options tuning cli"
 ).split()
 DOORS = {"__init__", "__main__"}  # may import everything
 FILES = sorted(HOME.rglob("*.py"))

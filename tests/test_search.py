@@ -154,26 +154,28 @@ def test_parts_are_kept_until_the_program_or_the_arguments_change(tmp_path, monk
 
 
 def test_each_start_is_off_by_a_factor_of_its_own(monkeypatch):
-    """And is tuned on some runs, then on all of them."""
+    """And is tuned on some runs a step, on some, then on all of them."""
     calls = []
 
     def tune(noise, config, logs, **how):
-        calls.append((recovery.theta_of(noise), how))
+        calls.append((recovery.theta_of(noise), len(logs), how))
         found = jax.tree.map(lambda x: 2.0 * x, noise)
         skipped = np.array([1, 0])
         return fit.Fit(found, 1, np.array([3.0, 2.0]), None, None, skipped)
 
     monkeypatch.setattr(fit, "tune", tune)
     monkeypatch.setattr(recovery, "position_rmse", lambda noise, logs: 0.5)
-    told = [recovery._recover(0, number, None, None) for number in range(40)]
+    train = np.zeros(200)
+    told = [recovery._recover(0, number, train, None) for number in range(40)]
     off = np.array([one["start"] for one in told]) - recovery.theta_of(exact.truth())
     reach = np.log(recovery.FACTOR)
     assert np.abs(off).max() <= reach and np.abs(off).max() > 0.95 * reach
     assert np.abs(off.mean()) < 4.5 * reach / np.sqrt(3 * off.size)
-    assert calls[0][1]["batch"] == recovery.PACK and "batch" not in calls[1][1]
+    assert [runs for _, runs, _ in calls[:3]] == [200, recovery.SOME, 200]
+    assert [how.get("batch") for _, _, how in calls[:3]] == [recovery.PACK, None, None]
     np.testing.assert_allclose(calls[1][0], told[0]["start"] + np.log(2), rtol=1e-6)
-    np.testing.assert_allclose(told[0]["theta"], told[0]["start"] + np.log(4), rtol=1e-6)
-    assert told[0]["loss"] == 2.0 and told[0]["skipped"] == 2
+    np.testing.assert_allclose(told[0]["theta"], told[0]["start"] + np.log(8), rtol=1e-6)
+    assert told[0]["loss"] == 2.0 and told[0]["skipped"] == 3
 
 
 def test_each_task_is_compared_on_its_own_runs_and_all_is_written(monkeypatch, tmp_path, capsys):

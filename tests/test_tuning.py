@@ -374,10 +374,9 @@ def test_references_are_as_many_as_logs_and_on_their_clock(refused, log, referen
 
 
 def test_logs_of_one_kind_and_scanner_are_tuned_together(refused, log, drives, reference, tmp_path):
-    assert refused(log, drives).startswith(
-        "LOG: logs of scans and MRCLAM data sets are tuned apart"
-    )
-    assert refused(drives, "--test", log).startswith("LOG: CARMEN logs and MRCLAM")
+    apart = "LOG: logs of scans and MRCLAM data sets are tuned apart"
+    assert refused(log, drives).startswith(apart)
+    assert refused(drives, "--test", log).startswith(apart)
     assert refused(drives, "--reference", reference).startswith("--reference: MRCLAM data sets br")
     other = write_carmen(tmp_path / "b.clf", beams=7)
     line = refused(log, other, "--reference", reference, reference)

@@ -205,6 +205,11 @@ def scene(name: str = "office"):
     return place, robot, path, monte_carlo.drive_steps(robot, path)
 
 
+def part(runs: Any, chosen: Any) -> Any:
+    """Some of the runs that lead records of arrays, as NumPy's."""
+    return jax.tree.map(lambda x: np.asarray(x)[chosen], runs)
+
+
 def many(key, config: slam.Config, noise: slam.Noise, runs: int, name: str = "office"):
     """Tracks of B runs of the drive in a world, with a progress bar."""
     from tqdm import tqdm

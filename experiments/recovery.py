@@ -7,9 +7,7 @@ model is true. Each start is off in every parameter by a factor of its own, at m
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
 from experiments import common, exact
@@ -29,7 +27,7 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
     """
     truth = exact.truth()
     logs = exact.drives(jax.random.key(seed), truth, runs=runs + heldout)
-    train, test = (_part(logs, part) for part in (slice(runs), slice(runs, None)))
+    train, test = (common.part(logs, part) for part in (slice(runs), slice(runs, None)))
     right = position_rmse(truth, test)
     rows = []
     with tqdm(total=starts, unit="start", desc="recovery", leave=False) as bar:
@@ -37,10 +35,10 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
             rows.append(kept(f"start {number}", lambda n=number: _recover(seed, n, train, test)))
             bar.update()
     best = min(rows, key=lambda row: row["loss"])
-    sure = kept("standard errors", lambda: _errors(noise_of(best["theta"]), train))
+    sure = kept("standard errors", lambda: _errors(fit.noise_of(best["theta"], truth), train))
     se = np.array([np.nan if x is None else x for x in sure["relative"]])
     known = np.array(sure["identifiable"])
-    off = np.array([row["theta"] for row in rows]) - theta_of(truth)
+    off = np.array([row["theta"] for row in rows]) - fit.theta_of(truth)
     z = off[:, known] / se[known]
     ratio = np.array([row["heldout_rmse_m"] for row in rows]) / right
     return {
@@ -55,22 +53,29 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
         "identifiable": sure["identifiable"],
         "standard_errors": sure["relative"],
         "warnings": sure["warnings"],
-        "log_truth": theta_of(truth),
+        "log_truth": fit.theta_of(truth),
         "rows": rows,
     }
 
 
 def _recover(seed: int, number: int, train: Log, test: Log) -> common.Numbers:
     """Tune from a start drawn at random."""
-    truth = theta_of(exact.truth())
+    truth = fit.theta_of(exact.truth())
     reach = np.log(FACTOR)
     start = truth + np.random.default_rng([seed, number]).uniform(-reach, reach, truth.size)
-    rough = fit.tune(noise_of(start), exact.CONFIG, train, steps=ROUGH, batch=PACK, seed=number)
-    near = fit.tune(rough.noise, exact.CONFIG, _part(train, slice(SOME)), steps=MIDDLE)
+    rough = fit.tune(
+        fit.noise_of(start, exact.truth()),
+        exact.CONFIG,
+        train,
+        steps=ROUGH,
+        batch=PACK,
+        seed=number,
+    )
+    near = fit.tune(rough.noise, exact.CONFIG, common.part(train, slice(SOME)), steps=MIDDLE)
     fine = fit.tune(near.noise, exact.CONFIG, train, steps=FINE)
     return {
         "start": start,
-        "theta": theta_of(fine.noise),
+        "theta": fit.theta_of(fine.noise),
         "loss": fine.loss[fine.best],
         "skipped": int(sum(one.skipped.sum() for one in (rough, near, fine))),
         "heldout_rmse_m": position_rmse(fine.noise, test),
@@ -85,21 +90,6 @@ def _errors(noise: Noise, train: Log) -> common.Numbers:
 def position_rmse(noise: Noise, logs: Log) -> float:
     """Position RMSE [m] of the filter on drives [B]."""
     return monte_carlo.evaluate(monte_carlo.tracks(exact.CONFIG, noise, logs))["position_rmse_m"]
-
-
-def noise_of(theta: Any) -> Noise:
-    """Noise of the logarithms (P,) of its parameters."""
-    flat, unravel = ravel_pytree(exact.truth())
-    return fit.constrain(unravel(jnp.asarray(theta, flat.dtype)))
-
-
-def theta_of(noise: Noise) -> np.ndarray:
-    """Logarithms (P,) float64 of a noise."""
-    return np.log(np.asarray(ravel_pytree(noise)[0], np.float64))
-
-
-def _part(logs: Log, chosen: slice) -> Log:
-    return jax.tree.map(lambda x: x[chosen], logs)
 
 
 def draw(axis: Any, told: common.Numbers) -> None:

@@ -9,10 +9,7 @@ from importlib.util import find_spec
 from time import perf_counter
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
 from experiments.common import Numbers
@@ -55,8 +52,8 @@ class Trace:
         if not loss < self._least:
             return
         self._least, now, begin = loss, self.seconds, perf_counter()
-        theta = np.log(np.asarray(ravel_pytree(noise)[0], np.float64))
-        told = {"evaluations": self.evaluations, "seconds": now, "loss": loss, "theta": theta}
+        told = {"evaluations": self.evaluations, "seconds": now, "loss": loss}
+        told["theta"] = fit.theta_of(noise)
         self.points.append(told | judge(self._task, noise))
         self._stopped += perf_counter() - begin
 
@@ -83,15 +80,13 @@ def compile_all(task: Task, loss: Loss) -> None:
 def by_gradient(task: Task, loss: Loss, steps: int) -> Numbers:
     """`fit.tune`."""
     trace = Trace(task)
-    like = ravel_pytree(task.hand)[1]
     with tqdm(total=steps + 1, unit="step", leave=False, desc=loss.__name__) as bar:
 
         def report(state: fit.State) -> None:
             at = int(state.step) - 1
-            theta = jnp.asarray(state.thetas[at], float)
             bar.set_postfix(loss=f"{state.loss[at]:.4g}")
             bar.update()
-            trace.add(fit.constrain(like(theta)), state.loss[at])
+            trace.add(fit.noise_of(state.thetas[at], task.hand), state.loss[at])
 
         how = {"loss": loss, "steps": steps, "frozen": task.frozen, "report": report}
         fit.tune(task.hand, task.config, task.train, **how)
@@ -144,16 +139,15 @@ def methods() -> list[str]:
 
 def by_search(task: Task, method: str, seed: int, seconds: float, least: int) -> Numbers:
     """Search for at least so many seconds and evaluations."""
-    flat, like = ravel_pytree(task.hand)
     moves = fit.free(task.hand, task.frozen)
     ask, tell = METHODS[method](int(moves.sum()), seed)
-    hand = np.log(np.asarray(flat, np.float64))
+    hand = fit.theta_of(task.hand)
     trace = Trace(task)
     with tqdm(total=round(seconds), unit="s", leave=False, desc=method) as bar:
         while trace.seconds < seconds or trace.evaluations < least:
             theta = hand.copy()
             theta[moves] += np.log(WIDE) * ask()
-            noise = fit.constrain(like(jnp.asarray(theta, flat.dtype)))
+            noise = fit.noise_of(theta, task.hand)
             values = fit.values(noise, task.config, task.train, calibrated)
             # A noise with which a run gives no number is no candidate.
             loss = float(values.mean()) if np.isfinite(values).all() else np.inf
@@ -174,8 +168,3 @@ def time_to(trace: Numbers, error: float) -> float | None:
     """Seconds until the held-out error was no larger than this; None: it never was."""
     times = [p["seconds"] for p in trace["points"] if (p["heldout_rmse_m"] or np.inf) <= error]
     return times[0] if times else None
-
-
-def part(logs: Log, chosen: Any) -> Log:
-    """Some of the runs."""
-    return jax.tree.map(lambda x: np.asarray(x)[chosen], logs)

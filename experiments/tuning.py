@@ -48,7 +48,7 @@ def office(seed: int, runs: int, heldout: int) -> search.Task:
     logs = monte_carlo.simulate(
         jax.random.key(seed), config, place, robot, path, runs=total, steps=scans
     )
-    train, test = (search.part(logs, part) for part in (slice(runs), slice(runs, total)))
+    train, test = (common.part(logs, part) for part in (slice(runs), slice(runs, total)))
     return search.Task(config, log_noise(), train, test)
 
 
@@ -96,7 +96,7 @@ def compare(
 def step_seconds(task: search.Task) -> common.Numbers:
     """Seconds of one step of tuning over many runs, compiled; the training runs again and again."""
     runs = len(task.train.motion)
-    logs = search.part(task.train, np.arange(STEP_RUNS) % runs)
+    logs = common.part(task.train, np.arange(STEP_RUNS) % runs)
     taken = []
     for _ in range(3):
         begin = perf_counter()

@@ -61,6 +61,17 @@ def constrain(theta: Noise) -> Noise:
     return jax.tree.map(jnp.exp, theta)
 
 
+def theta_of(noise: Noise) -> np.ndarray:
+    """Logarithms (P,) float64 of the parameters."""
+    return np.log(np.asarray(ravel_pytree(noise)[0], np.float64))
+
+
+def noise_of(theta: Any, like: Noise) -> Noise:
+    """Noise of logarithms (P,), with the fields and precision of another."""
+    flat, unravel = ravel_pytree(like)
+    return constrain(unravel(jnp.asarray(theta, flat.dtype)))
+
+
 def names(noise: Noise) -> tuple[str, ...]:
     """Names of the P parameters: `range`, or `odometry[2]` of several."""
     return tuple(
@@ -201,17 +212,15 @@ def tune(
         if number is not None and number < 1:
             raise ValueError(f"{name} is {number}; it must be 1 or more")
     noise = jax.tree.map(lambda x: jnp.asarray(x, float), noise)
-    start, unravel = ravel_pytree(noise)
     moves, runs = free(noise, frozen), logs.motion.shape[0]
     whole = batch is None or batch >= runs
     optimiser = usual(steps, whole=whole) if optimiser is None else optimiser
     optimiser = optax.with_extra_args_support(optimiser)
     if state is None:
         state = begin(noise, steps=steps, frozen=frozen, optimiser=optimiser)
-    noise_of = lambda theta: constrain(unravel(jnp.asarray(theta, start.dtype)))
 
     while state.step <= steps and not _stalled(state, patience):
-        now, step = noise_of(state.theta), int(state.step)
+        now, step = noise_of(state.theta, noise), int(state.step)
         some = logs
         if not whole:
             some = jax.tree.map(partial(_take, draw(seed, step, runs, batch)), logs)

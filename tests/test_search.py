@@ -13,12 +13,12 @@ from jaxslam.noise import sighting_noise
 
 HAND = sighting_noise()
 TASK = search.Task(exact.CONFIG, HAND, None, None, ("wall",))
-BEST = recovery.theta_of(HAND) + np.array([1.5, -3.0, 2.0, 1.0, -2.4, -3.0, 1.1, 0.0])
+BEST = fit.theta_of(HAND) + np.array([1.5, -3.0, 2.0, 1.0, -2.4, -3.0, 1.1, 0.0])
 
 
 def parabola(noise):
     """A loss of two runs that is least at BEST."""
-    return np.sum((recovery.theta_of(noise) - BEST) ** 2) + np.array([-0.1, 0.1])
+    return np.sum((fit.theta_of(noise) - BEST) ** 2) + np.array([-0.1, 0.1])
 
 
 @pytest.fixture
@@ -46,12 +46,12 @@ def test_a_search_starts_by_hand_keeps_its_best_and_pauses_its_clock(easy, metho
     found = search.by_search(TASK, method, 0, 60.0, 40)
     assert found["evaluations"] == 40 and found["seconds"] == 80.0
     points = found["points"]
-    np.testing.assert_allclose(points[0]["theta"], recovery.theta_of(HAND), rtol=1e-6)
+    np.testing.assert_allclose(points[0]["theta"], fit.theta_of(HAND), rtol=1e-6)
     loss = [point["loss"] for point in points]
     assert len(loss) > 2 and np.all(np.diff(loss) < 0)
     for point in points:
         assert point["seconds"] == 2.0 * point["evaluations"]
-        off = point["theta"] - recovery.theta_of(HAND)
+        off = point["theta"] - fit.theta_of(HAND)
         assert np.abs(off).max() <= np.log(search.WIDE) and off[-1] == 0.0
     assert search.by_search(TASK, method, 0, 60.0, 40)["points"][-1]["loss"] == loss[-1]
 
@@ -100,7 +100,7 @@ def test_rows_tell_what_was_found_in_the_time_and_evaluations_of_the_gradient():
 
 
 def test_recovery_counts_the_starts_that_end_near_the_truth(monkeypatch, tmp_path):
-    truth, size = recovery.theta_of(exact.truth()), 8
+    truth, size = fit.theta_of(exact.truth()), 8
     se = np.full(size, 0.1)
     se[1] = np.inf
     ends = truth + 0.1 * np.array([[2.9] * size, [-3.1] + [0.0] * (size - 1), [0.0] * size])
@@ -114,7 +114,7 @@ def test_recovery_counts_the_starts_that_end_near_the_truth(monkeypatch, tmp_pat
         return {"theta": ends[number], "loss": float(number)} | rest
 
     def errors(noise, config, logs):
-        np.testing.assert_allclose(recovery.theta_of(noise), ends[0], rtol=1e-6)
+        np.testing.assert_allclose(fit.theta_of(noise), ends[0], rtol=1e-6)
         known = np.isfinite(se)
         return curvature.Errors(fit.names(noise), se, np.eye(size), known, ("a warning",))
 
@@ -158,7 +158,7 @@ def test_each_start_is_off_by_a_factor_of_its_own(monkeypatch):
     calls = []
 
     def tune(noise, config, logs, **how):
-        calls.append((recovery.theta_of(noise), len(logs), how))
+        calls.append((fit.theta_of(noise), len(logs), how))
         found = jax.tree.map(lambda x: 2.0 * x, noise)
         skipped = np.array([1, 0])
         return fit.Fit(found, 1, np.array([3.0, 2.0]), None, None, skipped)
@@ -167,7 +167,7 @@ def test_each_start_is_off_by_a_factor_of_its_own(monkeypatch):
     monkeypatch.setattr(recovery, "position_rmse", lambda noise, logs: 0.5)
     train = np.zeros(200)
     told = [recovery._recover(0, number, train, None) for number in range(40)]
-    off = np.array([one["start"] for one in told]) - recovery.theta_of(exact.truth())
+    off = np.array([one["start"] for one in told]) - fit.theta_of(exact.truth())
     reach = np.log(recovery.FACTOR)
     assert np.abs(off).max() <= reach and np.abs(off).max() > 0.95 * reach
     assert np.abs(off.mean()) < 4.5 * reach / np.sqrt(3 * off.size)
@@ -188,7 +188,7 @@ def test_each_task_is_compared_on_its_own_runs_and_all_is_written(monkeypatch, t
         compared.append((data, task.train))
         return [tuning._row(data, "hand", point, 0.0, 0, trace, point)], {"gradient": trace}
 
-    theta = recovery.theta_of(exact.truth())
+    theta = fit.theta_of(exact.truth())
     rows = [{"start": theta + 0.1, "theta": theta}]
     sure = {"standard_errors": [0.1] * 8, "identifiable": [True] * 7 + [False]}
     told = {"starts": 1, "runs": 2, "within_3_se": 1, "worst_heldout_ratio": 1.0, "rows": rows}

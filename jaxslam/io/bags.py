@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, Recording, no_return
+from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
 from jaxslam.lidar import Lidar
 from jaxslam.metrics import composed, interpolate
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"  # the latter in old bags
 FIXED = "odom"  # frame in which wheels count
-TOLERATED = 0.05  # part of the scans that may be broken or lie outside the time of the odometry
 CHAIN = 32  # transforms between two frames at most
 
 

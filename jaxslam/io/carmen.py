@@ -16,13 +16,10 @@ import numpy as np
 
 from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, Recording, no_return
+from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
 from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
 from jaxslam.lidar import Lidar
-
-TOLERATED = 0.05
-"""Part of the ODOM and FLASER lines that may be broken: they are left out and counted."""
 
 _FORMS = {
     b"ODOM": "ODOM x y theta tv rv accel ipc_time host logger_time",

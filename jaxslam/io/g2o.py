@@ -16,14 +16,11 @@ import numpy as np
 
 from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, Recording, no_return
+from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
 from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
 from jaxslam.lidar import Lidar
 from jaxslam.metrics import chain
-
-TOLERATED = 0.05
-"""Part of the scans that may be broken: they are left out and counted."""
 
 _FORMS = {
     b"VERTEX_SE2": "VERTEX_SE2 id x y theta",

@@ -9,6 +9,9 @@ from jaxslam.lidar import Lidar
 NOISE = 0.02
 """Standard deviation [m] of a range; no log says it."""
 
+TOLERATED = 0.05
+"""Part of a log's lines or scans that may be broken: they are left out and counted."""
+
 
 class Recording(NamedTuple):
     """A recorded drive of T scans of R beams, in file order: time stamps may run backwards.

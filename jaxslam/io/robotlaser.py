@@ -1,8 +1,10 @@
 """ROBOTLASER1 lines: scans of the newer CARMEN toolkit, which pose graphs of g2o hold too.
 
-ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m
-laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side axis
-time host logger_time
+    ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m
+        laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side axis
+        time host logger_time
+
+n ranges, m remissions, and the poses by odometry.
 """
 
 import math

@@ -13,7 +13,7 @@ import tyro
 from tqdm import tqdm
 
 import jaxslam
-from jaxslam import lidar, metrics, monte_carlo, plan, report, skeleton, slam
+from jaxslam import film, lidar, logs, monte_carlo, plan, report, skeleton, slam
 from jaxslam import world as worlds
 from jaxslam.batches import use_cores
 from jaxslam.io import graphml, occupancy, readers, tum
@@ -23,6 +23,7 @@ from jaxslam.io.output import folder, write_json
 from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
 from jaxslam.options import keep_compiled, named, noise_of, stopwatch, within
+from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.tuning import tune
 from jaxslam.types import NODE
@@ -116,45 +117,59 @@ def run(
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")],
     reference: Path | None = None,
     relations: Path | None = None,
+    odometry: Literal["scan", "wheels"] = "scan",
     noise: Path | None = None,
+    scan: int | None = None,
+    animate: bool = False,
     out: Path = Path("out"),
 ) -> None:
     """Run SLAM on a recorded log.
 
-    Writes metrics.json, trajectory.tum, map.geojson, path.png and errors.png; the first scan is
-    made at the origin of the map.
+    Writes metrics.json, trajectory.tum, path.png and errors.png; the topological map as
+    map.geojson and, with the extra [graph], map.graphml; what the scans saw as map.yaml and
+    map.pgm, for map_server and `jaxslam map`; and graph.g2o, for optimisers. The first scan is made
+    at the origin of the map.
 
     Args:
         log: CARMEN log, ROS bag, pose graph of g2o with its scans, or recording as a NumPy file;
             `killian` is the log that the extra [data] brings.
         reference: Trajectory to compare with, a TUM file on the log's clock.
         relations: Verified relative poses to compare with, on the log's clock.
+        odometry: Scans aligned to those before and fused with the wheels, or the wheels alone.
         noise: File of the noise that the filter assumes; by default a cautious one.
+        scan: Number of a scan, from 0, whose local diagram is drawn: scan.png.
+        animate: Film the run: run.gif.
         out: Folder for the results.
     """
     recording = readers.read(log)
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
-    assumed = noise_of(noise, slam.log_noise())
+    by_scans = odometry == "scan"
+    assumed = noise_of(noise, slam.log_noise(aligned=by_scans))
+    if scan is not None:
+        within("--scan", scan, 0, len(recording.times) - 1)
     config = Config(lidar=recording.lidar, landmarks=LANDMARKS, confirm=CONFIRM)
-    wheels = metrics.seen_from(recording.odometry[0], recording.odometry)
+    wheels = seen_from(recording.odometry[0], recording.odometry)
     with named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)
     with named(f"{relations or ''}"):
         blind |= {} if verified is None else report.against_relations(recording, wheels, verified)
-    motions = np.concatenate([np.zeros((1, 3)), metrics.seen_from(wheels[:-1], wheels[1:])])
+    motions = logs.motions(wheels)
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
     with folder(out) as place:
         keep_compiled()
         print(f"{log}: {len(wheels)} scans of {config.lidar.beams} beams", flush=True)
         with stopwatch() as seconds:
             moved = jnp.asarray(motions, float)
-            survey = slam.survey(config, assumed, jnp.zeros(3), moved, scans)
+            aligned = logs.align(config, scans, motions) if by_scans else None
+            survey = slam.survey(config, assumed, jnp.zeros(3), moved, scans, aligned)
             poses = report.poses_of(survey)
         numbers = {
             "scans": len(poses),
             "skipped_lines": recording.skipped,
-            "path_length_m": report.length(wheels),
+            "mended": recording.mended,
+            "odometry": odometry,
+            "path_length_m": report.length(poses if by_scans else wheels),
             "landmarks": int(np.sum(survey.belief.seen >= slam.needed(config, survey.belief.kind))),
             "matches": float(np.mean(np.sum(np.asarray(survey.info.used), axis=1))),
             "seconds": seconds,
@@ -167,7 +182,13 @@ def run(
             numbers |= report.against_relations(recording, poses, verified)
         numbers |= {"dead_reckoning": blind} if blind else {}
         report.write(place, numbers, recording.times, survey)
+        inputs = slam.Inputs(moved, survey.nodes, aligned=aligned)
+        report.write_maps(place, config, assumed, survey, inputs, scans)
         report.draw(place, config, survey, lines, error, scans=scans)
+        if scan is not None:
+            report.draw_scan(place / "scan.png", config, scans, scan)
+        if animate:
+            film.film(place / "run.gif", config, assumed, inputs, scans, poses, wheels)
     report.tell(numbers, f"{len(poses)} scans of {log}", out)
 
 

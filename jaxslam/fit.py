@@ -21,8 +21,8 @@ from jaxslam import losses, slam
 from jaxslam.batches import Spread
 from jaxslam.descent import usual
 from jaxslam.losses import Loss, calibrated
-from jaxslam.monte_carlo import Log
-from jaxslam.slam import Config, Inputs, Noise
+from jaxslam.monte_carlo import Log, inputs_of
+from jaxslam.slam import Config, Noise
 from jaxslam.types import Array
 
 GROUP = 4  # runs that a device differentiates together; bounds memory
@@ -77,6 +77,7 @@ def names(noise: Noise) -> tuple[str, ...]:
     return tuple(
         f"{field}[{i}]" if np.ndim(value) else field
         for field, value in noise._asdict().items()
+        if value is not None
         for i in range(np.size(value))
     )
 
@@ -112,7 +113,7 @@ def scaled(noise: Noise, parameter: int, by: float) -> Noise:
 def _value(config: Config, loss: Loss, theta: Noise, log: Log) -> Array:
     """Loss () of one run."""
     start = slam.init(config, log.truth[0])
-    _, info = slam.run(config, constrain(theta), start, Inputs(log.motion, log.nodes, log.known))
+    _, info = slam.run(config, constrain(theta), start, inputs_of(log))
     return loss(info, log)
 
 

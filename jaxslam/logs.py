@@ -9,13 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import lidar, slam
+from jaxslam import alignment, lidar, slam
+from jaxslam.alignment import Aligned
 from jaxslam.batches import Spread
 from jaxslam.io.recording import Recording, Sightings
 from jaxslam.lidar import Scan
-from jaxslam.metrics import match_times, seen_from
+from jaxslam.metrics import match_times
 from jaxslam.monte_carlo import Log
 from jaxslam.nodes import Nodes, from_polar
+from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.types import NODE
 
@@ -38,6 +40,8 @@ def from_recording(
     recording: Recording,
     config: Config,
     reference: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    aligned: bool = False,
 ) -> Log:
     """A log of laser scans, from its first scan or the first that has a reference.
 
@@ -45,6 +49,7 @@ def from_recording(
         recording: T scans with wheel odometry.
         config: Of the front end.
         reference: Times (N,) [s] and poses (N, 3) on the log's clock.
+        aligned: Whether scans are aligned, as `Config.alignment` says, and fused with the wheels.
 
     Raises:
         ValueError: No scan is at a time of the reference.
@@ -57,9 +62,20 @@ def from_recording(
             raise ValueError("the reference has no pose at the time of a scan")
         truth[i], judged[i], begin = reference[1][j], True, int(i.min())
     wheels, truth, judged = wheels[begin:], truth[begin:], judged[begin:]
-    motion = np.concatenate([np.zeros((1, 3)), seen_from(wheels[:-1], wheels[1:])])
+    motion = motions(wheels)
     scans = lidar.limit(jnp.asarray(recording.ranges[begin:], float), config.lidar)
-    return _real(Log(truth, motion, look(config, scans), None, judged))
+    by_scans = align(config, scans, motion) if aligned else None
+    return _real(Log(truth, motion, look(config, scans), None, judged, aligned=by_scans))
+
+
+def motions(poses: np.ndarray) -> np.ndarray:
+    """Motion (T, 3) from each of poses (T, 3) to the next, zero at the first."""
+    return np.concatenate([np.zeros((1, 3)), seen_from(poses[:-1], poses[1:])])
+
+
+def align(config: Config, scans: Scan, motion: np.ndarray) -> Aligned:
+    """Motions [T] by scans [T], beginning at those of the wheels (T, 3)."""
+    return alignment.odometry(config.alignment, config.lidar, scans, jnp.asarray(motion, float))
 
 
 def from_sightings(sightings: Sightings) -> Log:
@@ -89,12 +105,14 @@ def stack(logs: Sequence[Log]) -> Log:
     """Logs of B drives as one; shorter ones stand still, blind, at their end.
 
     Raises:
-        ValueError: There are none, or some know their landmarks and some do not.
+        ValueError: There are none, or some know their landmarks, or have their scans aligned, and
+            some do not.
     """
     if not logs:
         raise ValueError("no logs")
-    if len({log.known is None for log in logs}) > 1:
-        raise ValueError("logs that know their landmarks go with such logs only")
+    for name in ("known", "aligned"):
+        if len({getattr(log, name) is None for log in logs}) > 1:
+            raise ValueError(f"logs with and without `{name}` do not go together")
     steps = max(len(log.motion) for log in logs)
     features = max(log.nodes.valid.shape[1] for log in logs)
 
@@ -112,6 +130,7 @@ def stack(logs: Sequence[Log]) -> Log:
             known=None if log.known is None else fill(log.known, features, -1),
             judged=fill(np.ones(len(log.truth), bool) if log.judged is None else log.judged),
             length=np.int32(len(log.truth)),
+            aligned=jax.tree.map(lambda x: fill(np.asarray(x)), log.aligned),
         )
         for log in logs
     ]

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from jaxslam.geometry import wrap_angle
+from jaxslam.poses import by_time, composed, interpolate, seen_from
 from jaxslam.types import Array
 
 
@@ -172,6 +173,55 @@ def ate(
     return {"ate_rmse_m": float(np.sqrt(np.mean(distance**2))), "matched": len(pairs)}
 
 
+def rpe(
+    times: np.ndarray,
+    poses: np.ndarray,
+    ref_times: np.ndarray,
+    ref_poses: np.ndarray,
+    tolerance: float = 0.05,
+    apart: float = 1.0,
+) -> dict[str, float | None]:
+    """Relative pose error: of the motions between poses of the reference some way apart.
+
+    Each motion begins where the one before it has ended, `apart` or more along the reference.
+
+    Args:
+        times: (N,) [s] of the estimate.
+        poses: (N, 3) [m, m, rad].
+        ref_times: (M,) [s] of the reference, same clock.
+        ref_poses: (M, 3) [m, m, rad], any frame.
+        tolerance: Largest difference [s] of times that belong together.
+        apart: Way [m] along the reference from one end of a motion to the other.
+
+    Returns:
+        `rpe_translation_rmse_m` and `rpe_rotation_rmse_deg`; None where the way is shorter.
+
+    Raises:
+        ValueError: `apart` is not positive.
+
+    References:
+        Sturm et al. (2012), A benchmark for the evaluation of RGB-D SLAM systems, section IV.
+    """
+    if not apart > 0.0:
+        raise ValueError(f"motions {apart} m apart")
+    i, j = match_times(times, ref_times, tolerance).T
+    own, goal = np.asarray(poses, np.float64)[i], np.asarray(ref_poses, np.float64)[j]
+    ends, way = [0], 0.0
+    for k, part in enumerate(np.hypot(*np.diff(goal[:, :2], axis=0).T), start=1):
+        way += part
+        if way >= apart:
+            ends.append(k)
+            way = 0.0
+    if len(ends) < 2:
+        return {"rpe_translation_rmse_m": None, "rpe_rotation_rmse_deg": None}
+    moved, wanted = (seen_from(x[ends[:-1]], x[ends[1:]]) for x in (own, goal))
+    error = seen_from(wanted, moved)
+    return {
+        "rpe_translation_rmse_m": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
+        "rpe_rotation_rmse_deg": float(np.degrees(np.sqrt(np.mean(error[:, 2] ** 2)))),
+    }
+
+
 def relations_error(
     times: np.ndarray,
     poses: np.ndarray,
@@ -231,52 +281,8 @@ def _pose_at(
     wheel_poses: np.ndarray,
 ) -> np.ndarray:
     """Poses (K, 3) at times (K,) [s]: the last estimate before, moved on by the wheels."""
-    times, poses = _by_time(times, poses)
+    times, poses = by_time(times, poses)
     last = np.searchsorted(times, wanted + slack, side="right") - 1
-    wheels = _by_time(wheel_times, wheel_poses)
+    wheels = by_time(wheel_times, wheel_poses)
     moved = seen_from(interpolate(times[last], *wheels), interpolate(wanted, *wheels))
     return composed(poses[last], moved)
-
-
-def _by_time(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times and poses in float64, sorted stably by time."""
-    order = np.argsort(times, kind="stable")
-    return np.asarray(times, np.float64)[order], np.asarray(poses, np.float64)[order]
-
-
-def interpolate(wanted: np.ndarray, times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (K, 3) at times (K,), linearly between those of (N,) sorted times."""
-    columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
-    return np.stack([np.interp(wanted, times, column) for column in columns], axis=-1)
-
-
-def composed(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """As `geometry.compose`, for (..., 3) in float64 whatever JAX's precision."""
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + c * motion[..., 0] - s * motion[..., 1]
-    y = pose[..., 1] + s * motion[..., 0] + c * motion[..., 1]
-    return np.stack([x, y, _wrap(pose[..., 2] + motion[..., 2])], axis=-1)
-
-
-def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (..., 3) in the frames of others (..., 3).
-
-    As `geometry.between`, in float64 whatever JAX's precision.
-    """
-    c, s = np.cos(frames[..., 2]), np.sin(frames[..., 2])
-    d = poses - frames
-    x, y = c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]
-    return np.stack([x, y, _wrap(d[..., 2])], axis=-1)
-
-
-def chain(moves: np.ndarray) -> np.ndarray:
-    """Poses (N + 1, 3) that start at zero and move by `moves` (N, 3), each in the frame before."""
-    poses = np.zeros((len(moves) + 1, 3))
-    for i, move in enumerate(moves):
-        poses[i + 1] = composed(poses[i], move)
-    return poses
-
-
-def _wrap(angle: np.ndarray) -> np.ndarray:
-    """As `geometry.wrap_angle`, in float64."""
-    return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))

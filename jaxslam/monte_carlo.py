@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 
 from jaxslam import lidar, motion, plan, slam
+from jaxslam.alignment import Aligned
 from jaxslam.batches import Spread, map_batches
 from jaxslam.geometry import compose
 from jaxslam.lidar import Scan
@@ -36,6 +37,12 @@ class Log(NamedTuple):
     known: Array | None = None  # (T, M) int32 landmark each feature is, -1 unknown; or match
     judged: Array | None = None  # (T,) bool, where the truth is known; everywhere unless given
     length: Array | None = None  # () int32 steps that took place, the first ones; all unless given
+    aligned: Aligned | None = None  # [T] the motions by scans, where odometry is taken from them
+
+
+def inputs_of(log: Log) -> Inputs:
+    """What the filter is given of a run."""
+    return Inputs(log.motion, log.nodes, log.known, log.aligned)
 
 
 class Track(NamedTuple):
@@ -164,9 +171,7 @@ def dead_reckoning(first: Array, told: Array) -> Array:
 
 def track(config: Config, noise: Noise, log: Log) -> Track:
     """Filter one run from its true start."""
-    belief, info = slam.run(
-        config, noise, slam.init(config, log.truth[0]), Inputs(log.motion, log.nodes, log.known)
-    )
+    belief, info = slam.run(config, noise, slam.init(config, log.truth[0]), inputs_of(log))
     return Track(
         truth=log.truth,
         estimate=info.pose,

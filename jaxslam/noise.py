@@ -19,6 +19,7 @@ class Noise(NamedTuple):
     bearing: Array  # () [rad] likewise
     scale: Array  # () factor on the landmark's own standard deviation
     wall: Array  # () [rad] of a wall's direction, beyond its own variance
+    alignment: Array | None = None  # () factor on the standard deviation of aligned motions, if any
 
 
 def sensor_noise(noise: Noise, nodes: Nodes, *, doubt: float = 1.0) -> Array:
@@ -44,9 +45,16 @@ def wheel_noise(robot: Robot) -> Noise:
     return _noise(wheel_coefficients(robot), range=0.002, bearing=0.001, scale=0.85, wall=0.0001)
 
 
-def log_noise() -> Noise:
-    """Noise for recorded logs of unknown robots: cautious."""
-    return _noise(jnp.full(4, 0.05), range=0.05, bearing=0.01, scale=1.5, wall=0.03)
+def log_noise(*, aligned: bool = False) -> Noise:
+    """Noise for recorded logs of unknown robots: cautious.
+
+    Args:
+        aligned: Whether scans are aligned, and their motions fused with the odometry.
+    """
+    rest = {"range": 0.05, "bearing": 0.01, "scale": 1.5, "wall": 0.03}
+    if aligned:  # wheels that slip must not pull at the heading that scans show
+        return _noise([0.1, 0.1, 0.2, 0.4], **rest, alignment=0.3)
+    return _noise([0.05] * 4, **rest)
 
 
 def sighting_noise() -> Noise:

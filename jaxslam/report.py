@@ -1,6 +1,7 @@
 """What the command line makes of a result: numbers, files, pictures and a summary."""
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -8,22 +9,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import lidar, metrics
+from jaxslam import lidar, mapping, metrics, slam
 from jaxslam.fit import Fit, names
-from jaxslam.io import geojson, tum
+from jaxslam.io import geojson, graphml, occupancy, posegraph, tum
 from jaxslam.io.occupancy import Occupancy
 from jaxslam.io.output import write_json
 from jaxslam.io.recording import Recording
 from jaxslam.io.relations import Relations
 from jaxslam.lidar import Scan
 from jaxslam.monte_carlo import Track
+from jaxslam.poses import seen_from
 from jaxslam.skeleton import Survey as MapSurvey
-from jaxslam.slam import Config, Survey
+from jaxslam.slam import Config, Inputs, Noise, Survey
 from jaxslam.topomap import Graph
 from jaxslam.types import NODE
 from jaxslam.world import World
 
 KINDS = ("node", "corner", "wall")
+CELL = 0.05  # [m] of the occupancy map
 
 Numbers = dict[str, Any]
 """What `metrics.json` holds."""
@@ -60,10 +63,10 @@ def aligned_error(tracks: Track) -> float | None:
 
 def against_reference(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> Numbers:
     """Errors of poses (T, 3) after rigid alignment with a reference."""
-    numbers = metrics.ate(times, poses, *known)
+    numbers = metrics.ate(times, poses, *known) | metrics.rpe(times, poses, *known)
     i, j = metrics.match_times(times, known[0]).T
     frame = metrics.align(poses[i, :2], known[1][j, :2])
-    turn = metrics.seen_from(metrics.seen_from(frame, known[1][j]), poses[i])[:, 2]
+    turn = seen_from(seen_from(frame, known[1][j]), poses[i])[:, 2]
     numbers["heading_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(turn**2))))
     return numbers
 
@@ -86,12 +89,10 @@ def beside(
     i, j = metrics.match_times(times, known[0]).T
     frame = metrics.align(poses[i, :2], known[1][j, :2])
     zero = np.zeros(3)
-    first = metrics.seen_from(
-        metrics.seen_from(known[1][j[0]], zero), metrics.seen_from(poses[i[0]], zero)
-    )
+    first = seen_from(seen_from(known[1][j[0]], zero), seen_from(poses[i[0]], zero))
     error = np.full(poses.shape, np.nan)
-    error[i] = error_of(poses[i], metrics.seen_from(first, known[1][j]))
-    return metrics.seen_from(frame, known[1][j]), error
+    error[i] = error_of(poses[i], seen_from(first, known[1][j]))
+    return seen_from(frame, known[1][j]), error
 
 
 def write(place: Path, numbers: Numbers, times: np.ndarray, survey: Survey) -> None:
@@ -99,6 +100,30 @@ def write(place: Path, numbers: Numbers, times: np.ndarray, survey: Survey) -> N
     write_json(place / "metrics.json", numbers)
     tum.write(place / "trajectory.tum", times, poses_of(survey))
     write_map(place / "map.geojson", survey.graph)
+
+
+def write_maps(
+    place: Path, config: Config, noise: Noise, survey: Survey, inputs: Inputs, scans: Scan
+) -> None:
+    """Write map.yaml, map.pgm, graph.g2o and, where networkx is there, map.graphml."""
+    grid = mapping.occupancy(poses_of(survey), scans, config.lidar, resolution=CELL)
+    occupancy.write(place / "map.yaml", grid)
+    posegraph.write(place / "graph.g2o", mapping.pose_graph(config, noise, survey, inputs))
+    if find_spec("networkx") is not None:
+        graphml.write(place / "map.graphml", survey.graph)
+
+
+def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
+    """Draw the local diagram of one of the scans [T]."""
+    from jaxslam import plot  # matplotlib takes its time to load
+
+    one = jax.tree.map(lambda x: x[number], scans)
+    seen, diagram, sources = jax.jit(slam.look, static_argnums=0)(config, one)
+    figure, axes = plot.canvas(8.0, 4.6)
+    plot.local(axes[0, 0], diagram, sources, config.grid, seen)
+    axes[0, 0].set_title(f"scan {number}")
+    plot.legend(figure)
+    figure.savefig(path)
 
 
 def write_map(path: Path, graph: Graph) -> None:
@@ -146,7 +171,8 @@ def draw(
 
     poses = poses_of(survey)
     walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
-    shown = [poses, survey.graph.xy, *lines.values(), *walls]
+    inside = [line for what, line in lines.items() if scans is None or what != "odometry"]
+    shown = [poses, survey.graph.xy, *inside, *walls]  # wheels may lead far off the map
     figure, axis = plot.plan(*plot.extent(*shown))
     if world is not None:
         plot.walls(axis, world)
@@ -170,6 +196,8 @@ ROWS = (
     ("position_rmse_m", "position RMSE", "m"),
     ("heading_rmse_deg", "heading RMSE", "deg"),
     ("ate_rmse_m", "position RMSE, aligned", "m"),
+    ("rpe_translation_rmse_m", "RMSE of motions of 1 m", "m"),
+    ("rpe_rotation_rmse_deg", "RMSE of motions of 1 m", "deg"),
     ("translation_mean_m", "error of relations", "m"),
     ("rotation_mean_deg", "error of relations", "deg"),
 )
@@ -180,6 +208,8 @@ def tell(numbers: Numbers, title: str, out: Path) -> None:
     print(f"\n{title}; a way of {numbers['path_length_m']:.0f} m")
     if numbers.get("skipped_lines"):
         print(f"{numbers['skipped_lines']} broken lines of the log were skipped")
+    for what in numbers.get("mended", ()):
+        print(f"note: {what}")
     blind = numbers.get("dead_reckoning", {})
     slam_has, wheels_have = (
         numbers | numbers.get("relations", {}),
@@ -257,7 +287,7 @@ def draw_history(path: Path, found: Fit) -> None:
 
     figure, axes = plot.canvas(11.0, 4.0, 1, 2)
     plot.losses(axes[0, 0], found.loss, found.heldout, found.best)
-    values = [np.asarray(x).reshape(len(found.loss), -1) for x in found.history]
+    values = [np.asarray(x).reshape(len(found.loss), -1) for x in jax.tree.leaves(found.history)]
     plot.parameters(axes[0, 1], names(found.noise), np.concatenate(values, axis=1), found.best)
     figure.savefig(path)
 
@@ -275,7 +305,10 @@ def tell_tuning(numbers: Numbers, title: str, out: Path) -> None:
     sure = numbers["standard_errors"] or {}
     if sure:
         print(f"  {'noise':30}{'':24}{'standard error':>18}")
-    old, new = (np.concatenate([np.ravel(x) for x in of["noise"]]) for of in (before, numbers))
+    old, new = (
+        np.concatenate([np.ravel(x) for x in jax.tree.leaves(of["noise"])])
+        for of in (before, numbers)
+    )
     for name, *values in zip(names(numbers["noise"]), old, new, strict=True):
         error = sure.get(name, np.nan)
         known = "" if np.isnan(error) else "unknown" if np.isinf(error) else f"{error:.0%}"

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import edges, ekf, junctions, links, nodes, topomap, voronoi
+from jaxslam import alignment, edges, ekf, junctions, links, nodes, topomap, voronoi
+from jaxslam.alignment import Aligned, AlignSpec
 from jaxslam.batches import map_batches
 from jaxslam.belief import Belief, forget, initial, note, worth
 from jaxslam.conditioning import drop, innovation_cov, log_likelihood
@@ -46,6 +47,7 @@ class Config(NamedTuple):
     matches: int = 8  # landmarks that update the state in one scan at most
     fresh: int = 8  # new landmarks in one scan at most
     matching: MatchSpec = MatchSpec()
+    alignment: AlignSpec = AlignSpec()  # of scans, where odometry is taken from them
     doubt: float = 3.0  # factor on the standard deviation of features that are not trusted
     confirm: int = 2  # sightings from which a landmark counts
     wall_confirm: int = 4  # likewise a wall direction: most scans show one, and a wrong one harms
@@ -60,6 +62,7 @@ class Inputs(NamedTuple):
     motion: Array  # (3,) odometry since the scan before
     nodes: Nodes  # features of this scan
     known: Array | None = None  # (M,) int32 landmark 0..L-1 each feature is, -1 unknown; or match
+    aligned: Aligned | None = None  # the same motion by scans, to be fused with the odometry
 
 
 class Info(NamedTuple):
@@ -178,6 +181,20 @@ def _outlive(
     return belief, jnp.sum(gone, dtype=jnp.int32), merged
 
 
+def moved(noise: Noise, inputs: Inputs) -> tuple[Array, Array]:
+    """Motion (3,) since the step before, and its covariance (3, 3) in the frame of that pose.
+
+    Raises:
+        ValueError: A motion is aligned, and `noise.alignment` is None; while tracing.
+    """
+    q = process_noise(noise.odometry, inputs.motion)
+    if inputs.aligned is None:
+        return inputs.motion, q
+    if noise.alignment is None:
+        raise ValueError("noise.alignment is None, and there are aligned motions")
+    return alignment.fuse(inputs.motion, q, inputs.aligned, noise.alignment)
+
+
 def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[Belief, Info]:
     """Predict by odometry, match, update, take in new landmarks.
 
@@ -191,9 +208,8 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
     size = belief.seen.size
     allowed = jnp.isin(inputs.nodes.kind, jnp.array(config.kinds, jnp.int32))
     seen = nodes.restrict(inputs.nodes, allowed)
-    q = process_noise(noise.odometry, inputs.motion)
     how = {"linearisation": config.linearisation}
-    before = ekf.predict(belief, inputs.motion, q, **how)._replace(step=belief.step + 1)
+    before = ekf.predict(belief, *moved(noise, inputs), **how)._replace(step=belief.step + 1)
     r = sensor_noise(noise, seen, doubt=config.doubt)
 
     if inputs.known is None:
@@ -297,7 +313,14 @@ def _arcs(config: Config, info: Info, joined: Links, scans: Scan) -> topomap.Arc
     return topomap.build(start, info.id, info.pose, joined, scans, config.lidar)
 
 
-def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Scan) -> Survey:
+def survey(
+    config: Config,
+    noise: Noise,
+    start: Array,
+    motions: Array,
+    scans: Scan,
+    aligned: Aligned | None = None,
+) -> Survey:
     """Run a whole log, and put its topological map together.
 
     Args:
@@ -306,9 +329,11 @@ def survey(config: Config, noise: Noise, start: Array, motions: Array, scans: Sc
         start: (3,) first pose.
         motions: (T, 3) odometry since the scan before, zero at the first.
         scans: [T].
+        aligned: [T] the same motions by scans, to be fused with the odometry.
     """
     seen, joined = local_maps(config, scans)
-    belief, info = run(config, noise, init(config, start), Inputs(motions, seen))
+    inputs = Inputs(motions, seen, aligned=aligned)
+    belief, info = run(config, noise, init(config, start), inputs)
     arcs = _arcs(config, info, joined, scans)
     graph = topomap.graph(
         belief,

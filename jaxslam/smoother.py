@@ -20,10 +20,9 @@ from jaxslam import arrow, sensor
 from jaxslam.arrow import Rows, State, times
 from jaxslam.geometry import between, rotation, wrap_angle, wrap_line
 from jaxslam.linalg import inverse_root
-from jaxslam.motion import process_noise
 from jaxslam.nodes import restrict
 from jaxslam.noise import Noise, sensor_noise
-from jaxslam.slam import Inputs
+from jaxslam.slam import Inputs, moved
 from jaxslam.types import WALL, Array, expect
 
 FLOOR = 1e-4  # [m], [rad] std that is added to each motion: a robot that stands still has none
@@ -75,10 +74,10 @@ def records(
     """
     expect("which", which, inputs.nodes.kind.shape, jnp.int32)
     nodes = jax.vmap(restrict)(inputs.nodes, which >= 0)
-    q = jax.vmap(process_noise, in_axes=(None, 0))(noise.odometry, inputs.motion)
+    motion, q = jax.vmap(moved, in_axes=(None, 0))(noise, inputs)
     return Records(
         start=start,
-        motion=inputs.motion,
+        motion=motion,
         q=q + (FLOOR**2 * jnp.eye(3, dtype=q.dtype))[None],
         seen=jax.vmap(sensor.observation)(nodes),
         r=jax.vmap(sensor_noise, in_axes=(None, 0))(noise, nodes),

@@ -49,6 +49,7 @@ def tune(
     ] = (),
     test: tuple[Path, ...] = (),
     reference: tuple[Path, ...] = (),
+    odometry: Literal["scan", "wheels"] = "scan",
     world: str = "office",
     runs: int = 32,
     heldout: int = 16,
@@ -67,9 +68,9 @@ def tune(
     before and after and the standard errors of the parameters, and history.png. When it is
     stopped, noise.json holds the best so far, and the same command goes on from there.
 
-    Tuned are the odometry's four coefficients and the sensor's range, bearing, scale and wall, by
-    gradient. What decides which feature is which landmark, such as the gate, is not smooth and is
-    not tuned.
+    Tuned are the odometry's four coefficients, the sensor's range, bearing, scale and wall, and
+    how far aligned scans are trusted (alignment), by gradient. What decides which feature is which
+    landmark, such as the gate, is not smooth and is not tuned.
 
     Args:
         logs: Logs of laser scans, as `jaxslam run` takes them, or folders of MRCLAM data sets
@@ -77,6 +78,7 @@ def tune(
         test: Logs to judge by, which nothing is tuned on.
         reference: A TUM file for each log of scans, first of those to tune on, then of --test;
             MRCLAM data sets bring their own.
+        odometry: Of logs of scans: scans aligned and fused with the wheels, or the wheels alone.
         world: Where simulated drives are.
         runs: Simulated drives to tune on.
         heldout: And to judge by.
@@ -87,7 +89,7 @@ def tune(
         batch: Drives that each step sees, in turn; by default all.
         patience: Stop after as many judgements without a better one; by default never.
         freeze: Parameters that stay: odometry, odometry[0] ... odometry[3], range, bearing, scale,
-            wall.
+            wall, alignment.
         noise: File of the noise to start from; by default a cautious one.
         seed: Of the simulated drives and of the order of batches.
         out: Folder for the results.
@@ -102,9 +104,9 @@ def tune(
         raise InputError("would be replaced by what is found", path=noise, advice=advice)
     chosen = losses.BY_NAME[loss]
     with named("--freeze"):
-        fit.free(slam.log_noise(), freeze)
+        fit.free(slam.log_noise(aligned=True), freeze)
     if logs:
-        make = _recorded(logs, test, reference, noise, chosen)
+        make = _recorded(logs, test, reference, odometry == "scan", noise, chosen)
     else:
         if test or reference:
             raise InputError("go with recorded logs", field="--test, --reference")
@@ -157,6 +159,7 @@ def _recorded(
     logs: Sequence[Path],
     test: Sequence[Path],
     reference: Sequence[Path],
+    aligned: bool,
     noise: Path | None,
     loss: Loss,
 ) -> Any:
@@ -181,7 +184,7 @@ def _recorded(
         ]
         advice = "use --loss likelihood"
     else:
-        start = noise_of(noise, slam.log_noise())
+        start = noise_of(noise, slam.log_noise(aligned=aligned))
         every = [readers.read(path) for path in (*logs, *test)]
         if reference and len(reference) != len(every):
             problem = f"{len(reference)} files for {len(every)} logs"
@@ -198,7 +201,7 @@ def _recorded(
                 advice = "compare their clocks, and the order of --reference"
                 raise InputError("has no pose at the time of a scan", path=path, advice=advice)
         parts = pairs[: len(logs)], pairs[len(logs) :]
-        read = lambda pair: log_of.from_recording(pair[0], config, pair[1])
+        read = lambda pair: log_of.from_recording(pair[0], config, pair[1], aligned=aligned)
         blind = [] if reference else logs
         advice = "give --reference, or use --loss likelihood"
     if losses.needs_truth(loss) and blind:

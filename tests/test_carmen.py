@@ -8,6 +8,7 @@ import pytest
 from jaxslam.io import carmen
 from jaxslam.io.errors import InputError
 from jaxslam.lidar import bearings
+from jaxslam.poses import composed, seen_from
 
 TAIL = "host 0.5"
 
@@ -45,9 +46,9 @@ def complaint(path, **options):
 
 def test_reads_every_value(tmp_path):
     lines = ["# a comment", "PARAM robot_width 0.5 x 0 h 0", flaser(3.25), odom(3.5), "SYNC tag 1"]
-    log = carmen.read(save(tmp_path / "a.clf", lines + ["", flaser(4.25, pose=(7, 8, -1.5))]))
+    log = carmen.read(save(tmp_path / "a.clf", lines + ["", flaser(4.25, pose=(2, 1, -1.5))]))
     np.testing.assert_array_equal(log.times, [3.25, 4.25])
-    np.testing.assert_allclose(log.odometry, [[0.325, -0.65, 0.0325], [7, 8, -1.5]])
+    np.testing.assert_allclose(log.odometry, [[0.325, -0.65, 0.0325], [2, 1, -1.5]])
     np.testing.assert_array_equal(log.ranges, [[1.0, 1.5, 2.0, 2.5]] * 2)
     np.testing.assert_array_equal(log.wheel_times, [3.5])
     np.testing.assert_allclose(log.wheel_poses, [[0.35, -0.7, 0.035]])
@@ -267,3 +268,64 @@ def test_broken_scans_of_the_newer_toolkit_are_told(tmp_path):
     text = complaint(save(tmp_path / "b.clf", [*good[:3], "ROBOTLASER1 0 1 2"]))
     assert ":4: cut or damaged: 4 fields (1 of 4" in text and "ROBOTLASER1 type first" in text
     assert "no odometry" in complaint(save(tmp_path / "c.clf", [robotlaser(t) for t in range(4)]))
+
+
+def way(t):
+    """A drive of 1 m/s along an arc."""
+    return np.array([10 * np.sin(0.1 * t), 10 - 10 * np.cos(0.1 * t), 0.1 * t])
+
+
+def told(t, pose):
+    """An ODOM line of a pose."""
+    x, y, theta = pose
+    return f"ODOM {x} {y} {theta} 1 0.1 0 {t} {TAIL}"
+
+
+def drive(pose_of_scan, pose_of_wheels, count=60):
+    """A log of a scan each second, between two readings of the wheels."""
+    lines = []
+    for t in range(count):
+        lines += [told(t, pose_of_wheels(t)), flaser(t + 0.25, pose=pose_of_scan(t + 0.25))]
+        lines.append(told(t + 0.5, pose_of_wheels(t + 0.5)))
+    return lines
+
+
+def test_poses_that_were_corrected_give_way_to_those_of_the_wheels(tmp_path):
+    drifting = lambda t: way(t) + np.array([0.05 * t, 0.0, 0.0])
+    log = carmen.read(save(tmp_path / "a.clf", drive(way, drifting)))
+    wanted = np.array([drifting(t) for t in log.times])
+    np.testing.assert_allclose(log.odometry, wanted, atol=0.02)
+    assert len(log.mended) == 1 and "ODOM lines are used" in log.mended[0]
+
+
+def test_poses_of_a_scanner_that_is_mounted_elsewhere_are_the_wheels_own(tmp_path):
+    mounted = lambda t: composed(way(t), np.array([0.3, -0.1, np.pi]))
+    log = carmen.read(save(tmp_path / "a.clf", drive(mounted, way)))
+    wanted = np.array([mounted(t) for t in log.times])
+    np.testing.assert_allclose(log.odometry, wanted, atol=1e-9)
+    assert log.mended == ()
+
+
+def test_odometry_that_starts_anew_goes_on_where_it_was(tmp_path):
+    start = way(30.5)
+    anew = lambda t: way(t) if t < 31 else seen_from(start, way(t))
+    log = carmen.read(save(tmp_path / "a.clf", drive(anew, anew)))
+    moved = seen_from(log.odometry[:-1], log.odometry[1:])
+    wanted = np.array([seen_from(way(t), way(t + 1)) for t in log.times[:-1]])
+    assert np.abs(moved[32:] - wanted[32:]).max() < 0.01
+    assert np.hypot(*moved[29:32, :2].T).max() < 1.1  # it stood still for half a second
+    assert len(log.mended) == 1 and "starts anew (1 x)" in log.mended[0]
+    alone = [line for line in drive(anew, anew) if line.startswith("FLASER")]
+    log = carmen.read(save(tmp_path / "b.clf", alone))
+    assert len(log.mended) == 1 and np.hypot(*np.diff(log.odometry, axis=0).T[:2]).max() < 1.1
+
+
+def test_odometry_that_jumps_all_the_time_is_refused(tmp_path):
+    thrown = lambda t: np.array([100 * np.sin(t * t), 0.0, 0.0])
+    text = complaint(save(tmp_path / "a.clf", drive(thrown, thrown)))
+    assert "jumps" in text and "name a log with wheel odometry" in text
+
+
+def test_logs_of_real_robots_need_no_mending(shared_data):
+    for name in ("aces/aces", "freiburg-101/freiburg-101", "intel/intel"):
+        assert carmen.read(shared_data / f"{name}.clf").mended == ()

@@ -6,15 +6,19 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import networkx
 import numpy as np
 import pytest
 from evo.core import metrics as evo_metrics
 from evo.core import sync
 from evo.tools import file_interface
+from PIL import Image
 
 import jaxslam
-from jaxslam import cli, geometry, lidar, metrics, options, world
-from jaxslam.io import carmen, tum
+from jaxslam import cli, geometry, lidar, options, world
+from jaxslam.geometry import to_world
+from jaxslam.io import carmen, occupancy, tum
+from jaxslam.poses import seen_from
 
 # The commands run in processes of their own, in float32 as users run them; a short drive and
 # hardly optimised programs (`conftest`) keep them quick.
@@ -75,15 +79,14 @@ def done(tmp_path_factory):
     stamps, (poses, _) = np.arange(SCANS) + 0.5, drive()
     tum.write(place / "reference.tum", stamps, poses)
     steps = zip(stamps[:-1], stamps[1:], drive()[0][:-1], drive()[0][1:], strict=True)
-    lines = ["{} {} {} {} 0 0 0 {}".format(a, b, *metrics.seen_from(p, q)) for a, b, p, q in steps]
+    lines = ["{} {} {} {} 0 0 0 {}".format(a, b, *seen_from(p, q)) for a, b, p, q in steps]
     (place / "pairs.relations").write_text("\n".join(lines) + "\n")
     options = ["--reference", place / "reference.tum", "--relations", place / "pairs.relations"]
     simulated = begin(
         "simulate", "--runs", 2, "--seed", 3, "--out", place / "simulated", cache=place / "cache"
     )
-    recorded = begin(
-        "run", log, *options, "--out", place / "a" / "recorded", cache="/dev/null/not-a-folder"
-    )
+    options += ["--scan", 3, "--animate", "--out", place / "a" / "recorded"]
+    recorded = begin("run", log, *options, cache="/dev/null/not-a-folder")
     said, errors = end(simulated)
     return SimpleNamespace(
         place=place,
@@ -153,11 +156,38 @@ def test_evo_reads_the_trajectories(done):
 
 
 def test_run_writes_its_files_and_nothing_else(done):
-    names = {"metrics.json", "trajectory.tum", "map.geojson", *PICTURES}
+    names = {"metrics.json", "trajectory.tum", "map.geojson", "map.graphml", "map.yaml", "map.pgm"}
+    names |= {"graph.g2o", "scan.png", "run.gif", *PICTURES}
     assert {file.name for file in done.recorded.iterdir()} == names
     assert [file.name for file in done.recorded.parent.iterdir()] == ["recorded"]
     check_map(done.recorded)
     check_pictures(done.recorded)
+    assert (done.recorded / "scan.png").read_bytes().startswith(b"\x89PNG")
+    with Image.open(done.recorded / "run.gif") as film:
+        assert film.n_frames == SCANS
+
+
+def test_the_map_of_a_run_is_that_of_the_world(done):
+    """Cells that are occupied lie on walls, and most walls that were seen are in the map."""
+    found = occupancy.read(done.recorded / "map.yaml")
+    assert found.resolution == 0.05
+    frame = drive()[0][0]
+    cells = np.argwhere(found.occupied) + 0.5
+    points = to_world(jnp.asarray(frame), jnp.asarray(cells * 0.05 + found.origin[:2]))
+    walls = world.named("office").walls
+    start, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    off = np.asarray(points)[:, None] - start[None]
+    part = np.clip(np.sum(off * along, -1) / np.sum(along**2, -1), 0.0, 1.0)
+    away = np.linalg.norm(off - part[..., None] * along, axis=-1).min(axis=1)
+    assert len(points) > 200 and np.quantile(away, 0.95) < 0.15
+
+
+def test_networkx_reads_the_graph(done):
+    graph = networkx.read_graphml(done.recorded / "map.graphml")
+    assert len(graph) == sum(
+        f["geometry"]["type"] == "Point"
+        for f in json.loads((done.recorded / "map.geojson").read_text())["features"]
+    )
 
 
 def test_run_beats_its_odometry(done):
@@ -302,5 +332,5 @@ def test_the_package_exports_what_it_says_and_not_much():
 
 def test_poses_seen_from_others_agree_with_geometry():
     a, b = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, -2.0]]), np.array([[0.0, 5.0, -3.0], [1.0, 1, 1]])
-    expected = jax.vmap(geometry.compose)(a, jnp.asarray(metrics.seen_from(a, b)))
+    expected = jax.vmap(geometry.compose)(a, jnp.asarray(seen_from(a, b)))
     np.testing.assert_allclose(expected, b, atol=1e-12)

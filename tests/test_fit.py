@@ -22,7 +22,7 @@ def part(logs, chosen):
 
 
 def flat(noise):
-    return np.concatenate([np.ravel(x) for x in noise])
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(noise)])
 
 
 @pytest.fixture(scope="module")

@@ -152,8 +152,8 @@ def test_match_times_equals_brute_force():
     assert 0 < len(expected) < 40
 
 
-def ate_by_evo(estimate_file, reference_file):
-    """Absolute trajectory error [m] by the evo package, which reads the files itself."""
+def by_evo(estimate_file, reference_file):
+    """ATE [m] and RPE [m], [deg] over 1 m by the evo package, which reads the files itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from evo.core import metrics as evo_metrics
@@ -164,22 +164,45 @@ def ate_by_evo(estimate_file, reference_file):
         reference = file_interface.read_tum_trajectory_file(str(reference_file))
         reference, estimate = sync.associate_trajectories(reference, estimate, max_diff=0.05)
         estimate.align(reference, correct_scale=False)
-        error = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
-        error.process_data((reference, estimate))
-        return error.get_statistic(evo_metrics.StatisticsType.rmse), estimate.num_poses
+        kinds = evo_metrics.PoseRelation
+        how = {"delta": 1.0, "delta_unit": evo_metrics.Unit.meters, "pairs_from_reference": True}
+        errors = (
+            evo_metrics.APE(kinds.translation_part),
+            evo_metrics.RPE(kinds.translation_part, **how),
+            evo_metrics.RPE(kinds.rotation_angle_deg, **how),
+        )
+        for error in errors:
+            error.process_data((reference, estimate))
+        rmse = evo_metrics.StatisticsType.rmse
+        return *(error.get_statistic(rmse) for error in errors), estimate.num_poses
 
 
-def test_ate_equals_evo(tmp_path):
+def ate_and_rpe(*given):
+    """The same by this package."""
+    found = metrics.ate(*given) | metrics.rpe(*given)
+    names = "ate_rmse_m", "rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "matched"
+    return tuple(found[name] for name in names)
+
+
+def test_ate_and_rpe_equal_evo(tmp_path):
     times, poses = drive(5)
     rng = np.random.default_rng(6)
     moved = compose(np.tile([4.0, -2.0, 1.0], (60, 1)), poses)
     estimate = moved + rng.normal(0, 0.3, moved.shape)
     tum.write(tmp_path / "truth.tum", times, poses)
     tum.write(tmp_path / "estimate.tum", times[5:] + 0.01, estimate[5:])
-    found = metrics.ate(times[5:] + 0.01, estimate[5:], times, poses)
-    expected, count = ate_by_evo(tmp_path / "estimate.tum", tmp_path / "truth.tum")
-    np.testing.assert_allclose(found["ate_rmse_m"], expected, rtol=1e-9)
-    assert found["matched"] == count == 55 and 0.1 < expected < 1.0
+    found = ate_and_rpe(times[5:] + 0.01, estimate[5:], times, poses)
+    expected = by_evo(tmp_path / "estimate.tum", tmp_path / "truth.tum")
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert expected[-1] == 55 and 0.1 < expected[0] < 1.0
+
+
+def test_rpe_of_a_way_too_short_is_none_and_the_distance_is_checked():
+    times, poses = drive(5)
+    short = metrics.rpe(times, poses, times, poses, apart=1e3)
+    assert set(short.values()) == {None}
+    with pytest.raises(ValueError, match="motions 0.0 m apart"):
+        metrics.rpe(times, poses, times, poses, apart=0.0)
 
 
 def test_ate_of_moved_truth_is_zero_and_other_clocks_are_told():
@@ -270,11 +293,11 @@ def test_intel_reference_and_wheels_score_what_is_published(shared_data):
     assert 7.3 < wheels["translation_mean_m"] < 7.5
 
 
-def test_ate_of_recorded_wheels_equals_evo(shared_data, tmp_path):
+def test_ate_and_rpe_of_recorded_wheels_equal_evo(shared_data, tmp_path):
     log = carmen.read(shared_data / "aces" / "aces.clf")
     file = shared_data / "aces" / "aces.reference.tum"
     tum.write(tmp_path / "wheels.tum", log.times, log.odometry)
-    found = metrics.ate(log.times, log.odometry, *tum.read(file))
-    expected, count = ate_by_evo(tmp_path / "wheels.tum", file)
-    np.testing.assert_allclose(found["ate_rmse_m"], expected, rtol=1e-6)
-    assert found["matched"] == count == 440
+    found = ate_and_rpe(log.times, log.odometry, *tum.read(file))
+    expected = by_evo(tmp_path / "wheels.tum", file)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert expected[-1] == 440

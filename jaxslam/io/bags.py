@@ -16,7 +16,7 @@ import numpy as np
 from jaxslam.io.errors import InputError
 from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
 from jaxslam.lidar import Lidar
-from jaxslam.metrics import composed, interpolate
+from jaxslam.poses import composed, interpolate
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"  # the latter in old bags

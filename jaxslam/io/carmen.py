@@ -5,7 +5,9 @@
     ROBOTLASER1 ... (`robotlaser`)
 
 All other messages and comments are passed over, and ROBOTLASER1 too where there is FLASER, which
-then holds the same scans. Poses of ROBOTLASER1 are those of the laser.
+then holds the same scans. Poses of ROBOTLASER1 are those of the laser. Where odometry was started
+anew, or the scans have poses that another program corrected, the wheels' own are put together again
+from the ODOM lines, and `Recording.mended` tells so.
 """
 
 import math
@@ -19,7 +21,9 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
 from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
+from jaxslam.io.wheels import foreign, without_jumps
 from jaxslam.lidar import Lidar
+from jaxslam.poses import by_time, interpolate
 
 _FORMS = {
     b"ODOM": "ODOM x y theta tv rv accel ipc_time host logger_time",
@@ -175,14 +179,31 @@ def _joined(
         problem = f"no odometry: its pose is the same in all {len(stamped)} scans"
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
     stream = np.array(wheels) if wheels else stamped  # (N, 4)
+    times, wheel_times = stamped[:, 0].copy(), stream[:, 0].copy()
+    corrected = bool(wheels) and foreign(times, stamped[:, 1:], wheel_times, stream[:, 1:])
+    wheel_poses, restarts = without_jumps(wheel_times, stream[:, 1:].copy())
+    if restarts > TOLERATED * len(stream):
+        problem = f"its odometry jumps {restarts} times in {len(stream)} lines"
+        raise InputError(problem, path=path, advice="name a log with wheel odometry")
+    mended = []
+    if restarts:
+        mended.append(f"odometry starts anew ({restarts} x): the robot stands still there")
+    if corrected:
+        mended.append("poses of the scans are not those of the wheels: ODOM lines are used instead")
+    odometry = stamped[:, 1:].copy()
+    if wheels and mended:
+        odometry = interpolate(times, *by_time(wheel_times, wheel_poses))
+    elif not wheels:
+        odometry = wheel_poses.copy()
     return Recording(
-        times=stamped[:, 0].copy(),
-        odometry=stamped[:, 1:].copy(),
+        times=times,
+        odometry=odometry,
         ranges=ranges,
         lidar=lidar,
         skipped=skipped,
-        wheel_times=stream[:, 0].copy(),
-        wheel_poses=stream[:, 1:].copy(),
+        wheel_times=wheel_times,
+        wheel_poses=wheel_poses,
+        mended=tuple(mended),
     )
 
 

@@ -20,7 +20,7 @@ from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
 from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
 from jaxslam.lidar import Lidar
-from jaxslam.metrics import chain
+from jaxslam.poses import chain
 
 _FORMS = {
     b"VERTEX_SE2": "VERTEX_SE2 id x y theta",

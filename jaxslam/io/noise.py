@@ -25,14 +25,15 @@ def write(path: str | PathLike, noise: Noise) -> None:
 
     Args:
         path: File to write, all of it or nothing.
-        noise: NamedTuple of arrays, finite and positive.
+        noise: NamedTuple of arrays, finite and positive, or None for what is left out.
 
     Raises:
         InputError: A value is not finite and positive, or the file cannot be written.
     """
-    for name, value in noise._asdict().items():
+    known = {name: value for name, value in noise._asdict().items() if value is not None}
+    for name, value in known.items():
         _check_values(path, name, np.asarray(value, np.float64))
-    write_json(path, {"format": FORMAT, "version": VERSION, "noise": noise})
+    write_json(path, {"format": FORMAT, "version": VERSION, "noise": known})
 
 
 def read(path: str | PathLike, template: Noise) -> Noise:
@@ -40,7 +41,8 @@ def read(path: str | PathLike, template: Noise) -> Noise:
 
     Args:
         path: File that `write` wrote.
-        template: Record with the fields, shapes and dtypes to expect.
+        template: Record with the fields, shapes and dtypes to expect; what is None there may be in
+            the file, and stays None.
 
     Returns:
         A record of the template's type.
@@ -54,10 +56,11 @@ def read(path: str | PathLike, template: Noise) -> Noise:
     for name in fields.keys() - expected.keys():
         advice = f"the fields are {', '.join(expected)}"
         raise InputError("unknown field", path=path, field=name, advice=advice)
+    expected = {name: like for name, like in expected.items() if like is not None}
     for name in expected:
         if name not in fields:
             raise InputError("missing", path=path, field=name, advice="add it, or tune again")
-    return type(template)(
+    return template._replace(
         **{name: _field(path, name, fields[name], like) for name, like in expected.items()}
     )
 

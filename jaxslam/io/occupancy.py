@@ -1,6 +1,6 @@
 """Occupancy maps of ROS: a map_server YAML file and its image.
 
-The YAML needs the extra `[ros]`; images are read by Pillow, which matplotlib brings along.
+To read the YAML needs the extra `[ros]`; images are read by Pillow, which matplotlib brings along.
 """
 
 import math
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxslam.io.errors import InputError
+from jaxslam.io.output import replace, write_text
 from jaxslam.io.text import lines
 
 CELLS = 2**26  # most cells of a map
@@ -87,6 +88,35 @@ def read(path: str | PathLike) -> Occupancy:
     turned = lambda cells: np.ascontiguousarray(cells[::-1].T)  # rows of an image go down
     occupied, free = turned(known & (chance > high)), turned(known & (chance < low))
     return Occupancy(occupied, free, resolution, origin)
+
+
+def write(path: str | PathLike, occupancy: Occupancy) -> None:
+    """Write a map: the YAML file and, beside it, its image of the same name.
+
+    Args:
+        path: YAML file to write, all of it or nothing, after the image.
+        occupancy: The map.
+
+    Raises:
+        InputError: A file cannot be written.
+    """
+    path = Path(path)
+    shade = np.where(occupancy.occupied, 0, np.where(occupancy.free, 254, 205)).astype(np.uint8)
+    rows = np.ascontiguousarray(shade.T[::-1])
+    image = path.with_suffix(".pgm")
+    with replace(image) as file:
+        file.write(b"P5\n%d %d\n255\n" % rows.shape[::-1] + rows.tobytes())
+    x, y, turn = (float(value) for value in occupancy.origin)
+    fields = {
+        "image": image.name,
+        "mode": "trinary",
+        "resolution": f"{occupancy.resolution!r}",
+        "origin": f"[{x!r}, {y!r}, {turn!r}]",
+        "negate": "0",
+        "occupied_thresh": "0.65",
+        "free_thresh": "0.196",  # the shade 205 of unknown cells lies just above
+    }
+    write_text(path, "".join(f"{name}: {value}\n" for name, value in fields.items()))
 
 
 def _chance(shade: np.ndarray, mode: str, negate: bool) -> np.ndarray:

@@ -1,32 +1,24 @@
-"""Figures of worlds, trajectories, maps, errors and local diagrams, drawn on given axes.
+"""Places: worlds, trajectories, landmarks, arcs, occupancy grids, the local diagram of a scan.
 
-The only module that imports matplotlib. Colours are those of Okabe and Ito, which colour-blind
-people can tell apart; lines also differ in style, and landmarks in shape.
+Lines differ in style as well as in colour, and landmarks in shape.
 """
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import Affine2D
 
 from jaxslam.belief import Belief
 from jaxslam.grid import GridSpec
 from jaxslam.io.occupancy import Occupancy
 from jaxslam.nodes import Nodes
+from jaxslam.plot.sheet import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SIGMAS, SKY, YELLOW
 from jaxslam.topomap import Graph
 from jaxslam.types import CORNER, NODE
 from jaxslam.voronoi import Diagram, branches
 from jaxslam.world import World
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
-    *("#000000", "#E69F00", "#56B4E9", "#009E73"),
-    *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
-)
-GREY = "#8C8C8C"
-SIGMAS = 3.0  # standard deviations that ellipses and bounds show
 DOTS = 40_000  # ends of beams drawn at most
 
 # Colour, width, dashes and height in the picture of each trajectory.
@@ -38,33 +30,6 @@ LINES = {
 }
 # Marker, colour and name in the legend of each kind of landmark that has a place.
 MARKS = {NODE: ("o", GREEN, "node"), CORNER: ("s", ORANGE, "corner")}
-
-
-def canvas(
-    width: float, height: float, rows: int = 1, columns: int = 1
-) -> tuple[Figure, np.ndarray]:
-    """Figure of a size [inch], 100 dots to the inch, and its axes (rows, columns)."""
-    figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
-    shared = "col" if rows > 1 else False
-    return figure, figure.subplots(rows, columns, squeeze=False, sharex=shared)
-
-
-def plan(low: np.ndarray, high: np.ndarray) -> tuple[Figure, Axes]:
-    """Figure 900 dots wide of the rectangle from `low` (2,) to `high` (2,) [m, world]."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    margin = 0.03 * np.max(high - low) + 0.2
-    low, high = low - margin, high + margin
-    width, height = high - low
-    figure, axes = canvas(9.0, float(np.clip(8.2 * height / width, 2.5, 9.0)) + 1.1)
-    axis = axes[0, 0]
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axis.set(xlabel="x [m]", ylabel="y [m]")
-    return figure, axis
-
-
-def legend(figure: Figure) -> None:
-    """Put one legend below all that is drawn."""
-    figure.legend(loc="outside lower center", ncols=4, frameon=False)
 
 
 def walls(axis: Axes, world: World) -> None:
@@ -101,6 +66,16 @@ def trajectory(axis: Axes, poses: np.ndarray, what: str) -> None:
     color, width, dashes, height = LINES[what]
     style = {"color": color, "linewidth": width, "linestyle": dashes, "zorder": height}
     axis.plot(*np.asarray(poses)[:, :2].T, label=what, **style)
+
+
+def robot(axis: Axes, pose: np.ndarray, ends: np.ndarray) -> None:
+    """Draw a robot at a pose (3,) and the ends (N, 2) of its beams [m, robot frame]."""
+    x, y, heading = np.asarray(pose, float)
+    c, s = np.cos(heading), np.sin(heading)
+    there = x + c * ends[:, 0] - s * ends[:, 1], y + s * ends[:, 0] + c * ends[:, 1]
+    axis.plot(*there, ".", color=ORANGE, markersize=2.5, zorder=2.5, label="scan")
+    marker = (3, 0, np.degrees(heading) - 90)
+    axis.plot(x, y, marker=marker, color=BLUE, markersize=10, zorder=4, label="_robot")
 
 
 def ends(axis: Axes, poses: np.ndarray) -> None:
@@ -156,34 +131,6 @@ def arcs(axis: Axes, graph: Graph) -> None:
     axis.add_collection(LineCollection(graph.lines, label="arc", **style))
 
 
-def errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -> None:
-    """Draw errors of heading, y and x with their 3-sigma bounds over the scans.
-
-    Args:
-        axes: (3,) axes, one below the other.
-        cov: (T, 3, 3) covariance of the poses.
-        error: (T, 3) [m, m, rad]; the bounds alone without it.
-
-    References:
-        Paper, Fig. 13.
-    """
-    bound = SIGMAS * np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))  # (T, 3)
-    scan = np.arange(len(bound))
-    names = (("heading [deg]", 2, 180 / np.pi), ("y [m]", 1, 1.0), ("x [m]", 0, 1.0))
-    for axis, (name, k, unit) in zip(axes, names, strict=True):
-        high = unit * bound[:, k]
-        axis.fill_between(scan, -high, high, color=SKY, alpha=0.35, linewidth=0)
-        axis.plot(scan, high, color=BLUE, linewidth=1.0, label=f"{SIGMAS:g}-sigma bound")
-        axis.plot(scan, -high, color=BLUE, linewidth=1.0)
-        if error is not None:
-            axis.plot(scan, unit * error[:, k], color=BLACK, linewidth=1.2, label="error")
-        axis.axhline(0.0, color=GREY, linewidth=0.6)
-        axis.set(ylabel=name, xlim=(0, max(len(scan) - 1, 1)))
-        axis.margins(y=0.08)
-    axes[-1].set_xlabel("scan")
-    axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
-
-
 def local(
     axis: Axes, diagram: Diagram, sources: np.ndarray, spec: GridSpec, seen: Nodes | None = None
 ) -> None:
@@ -212,13 +159,6 @@ def local(
             _marks(axis, xy, cov, np.asarray(seen.valid & (seen.kind == kind)), kind)
     axis.set(xlim=(spec.side, -spec.side), ylim=(-spec.behind, spec.ahead), aspect="equal")
     axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")
-
-
-def extent(*groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x, y (2,) [m] of groups of points (N, 2) or poses (N, 3)."""
-    points = np.concatenate([np.asarray(group)[:, :2] for group in groups])
-    points = points[np.isfinite(points).all(axis=1)]
-    return points.min(axis=0), points.max(axis=0)
 
 
 def outline(map: Occupancy) -> np.ndarray:
@@ -261,32 +201,3 @@ def roads(axis: Axes, graph: Graph) -> None:
         if use.any():
             edge = {"markeredgewidth": 0.4, "linestyle": "none"}
             axis.plot(*graph.xy[use].T, marker, label=name, **style, **edge)
-
-
-def losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> None:
-    """Draw losses over the evaluations (N,) of a fit, those of held-out runs where not NaN."""
-    steps = np.arange(len(training))
-    axis.plot(steps, training, color=SKY, label="training")
-    judged = np.isfinite(heldout)
-    if judged.any():
-        axis.plot(steps[judged], heldout[judged], color=ORANGE, linestyle="--", label="held out")
-    axis.axvline(best, color=GREY, linewidth=0.8, label="best")
-    axis.set(xlabel="evaluation", ylabel="loss")
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axis.legend(frameon=False)
-
-
-def parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, best: int) -> None:
-    """Draw parameters (N, P) over the evaluations of a fit, in units of where they began."""
-    colours = (BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK, GREY)
-    styles = ("-", "--", "-.", ":")
-    for i, (name, values) in enumerate(zip(names, history.T, strict=True)):
-        look = {"color": colours[i % len(colours)], "linestyle": styles[i % len(styles)]}
-        axis.plot(values / values[0], label=name, **look)
-    axis.axvline(best, color=GREY, linewidth=0.8)
-    axis.set(xlabel="evaluation", ylabel="noise / noise at the start", yscale="log")
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter(NullFormatter())
-    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -1,0 +1,64 @@
+"""Numbers: errors over the scans of a run, losses and parameters over the steps of a fit."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from jaxslam.plot.sheet import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SIGMAS, SKY
+
+
+def errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -> None:
+    """Draw errors of heading, y and x with their 3-sigma bounds over the scans.
+
+    Args:
+        axes: (3,) axes, one below the other.
+        cov: (T, 3, 3) covariance of the poses.
+        error: (T, 3) [m, m, rad]; the bounds alone without it.
+
+    References:
+        Paper, Fig. 13.
+    """
+    bound = SIGMAS * np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))  # (T, 3)
+    scan = np.arange(len(bound))
+    names = (("heading [deg]", 2, 180 / np.pi), ("y [m]", 1, 1.0), ("x [m]", 0, 1.0))
+    for axis, (name, k, unit) in zip(axes, names, strict=True):
+        high = unit * bound[:, k]
+        axis.fill_between(scan, -high, high, color=SKY, alpha=0.35, linewidth=0)
+        axis.plot(scan, high, color=BLUE, linewidth=1.0, label=f"{SIGMAS:g}-sigma bound")
+        axis.plot(scan, -high, color=BLUE, linewidth=1.0)
+        if error is not None:
+            axis.plot(scan, unit * error[:, k], color=BLACK, linewidth=1.2, label="error")
+        axis.axhline(0.0, color=GREY, linewidth=0.6)
+        axis.set(ylabel=name, xlim=(0, max(len(scan) - 1, 1)))
+        axis.margins(y=0.08)
+    axes[-1].set_xlabel("scan")
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
+
+
+def losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> None:
+    """Draw losses over the evaluations (N,) of a fit, those of held-out runs where not NaN."""
+    steps = np.arange(len(training))
+    axis.plot(steps, training, color=SKY, label="training")
+    judged = np.isfinite(heldout)
+    if judged.any():
+        axis.plot(steps[judged], heldout[judged], color=ORANGE, linestyle="--", label="held out")
+    axis.axvline(best, color=GREY, linewidth=0.8, label="best")
+    axis.set(xlabel="evaluation", ylabel="loss")
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.legend(frameon=False)
+
+
+def parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, best: int) -> None:
+    """Draw parameters (N, P) over the evaluations of a fit, in units of where they began."""
+    colours = (BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK, GREY)
+    styles = ("-", "--", "-.", ":")
+    for i, (name, values) in enumerate(zip(names, history.T, strict=True)):
+        look = {"color": colours[i % len(colours)], "linestyle": styles[i % len(styles)]}
+        axis.plot(values / values[0], label=name, **look)
+    axis.axvline(best, color=GREY, linewidth=0.8)
+    axis.set(xlabel="evaluation", ylabel="noise / noise at the start", yscale="log")
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

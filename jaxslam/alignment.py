@@ -36,7 +36,7 @@ class AlignSpec(NamedTuple):
     recent: int = 6  # scans of the local map that a guess is made with
     thin: int = 4  # and every so many beams
     far: tuple[float, ...] = (0.8, 0.7, 0.6, 0.5, 0.4)  # [m] to a partner, round by round: a guess
-    near: tuple[float, ...] = (0.4, 0.35, 0.3, 0.25, 0.2, 0.15)  # and the result
+    near: tuple[float, ...] = (0.4, 0.25, 0.15)  # and the result
     kernel: tuple[float, float] = (0.1, 0.05)  # [m] residual that counts a quarter, likewise
     inner: int = 3  # steps of Gauss-Newton with the same partners
     noise: float = 0.1  # [m] of a point off its line: much more than a range's, as errors go along

@@ -29,9 +29,7 @@ from jaxslam.tuning import tune
 from jaxslam.types import NODE
 from jaxslam.world import World
 
-LANDMARKS = 256  # room for those of a recorded log
 AREA = 1.0  # [m^2] of the smallest region of a map that is drawn
-CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 `jaxslam COMMAND --help` lists the options of a command, `jaxslam --version` prints the version."""
 
@@ -119,6 +117,8 @@ def run(
     relations: Path | None = None,
     odometry: Literal["scan", "wheels"] = "scan",
     noise: Path | None = None,
+    scan_topic: str | None = None,
+    odometry_topic: str | None = None,
     scan: int | None = None,
     animate: bool = False,
     out: Path = Path("out"),
@@ -137,18 +137,20 @@ def run(
         relations: Verified relative poses to compare with, on the log's clock.
         odometry: Scans aligned to those before and fused with the wheels, or the wheels alone.
         noise: File of the noise that the filter assumes; by default a cautious one.
+        scan_topic: Topic of the laser scans in a bag; by default that with most messages.
+        odometry_topic: Topic of the odometry in a bag, or of the transforms; likewise.
         scan: Number of a scan, from 0, whose local diagram is drawn: scan.png.
         animate: Film the run: run.gif.
         out: Folder for the results.
     """
-    recording = readers.read(log)
+    recording = readers.read(log, scans=scan_topic, odometry=odometry_topic)
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
     by_scans = odometry == "scan"
     assumed = noise_of(noise, slam.log_noise(aligned=by_scans))
     if scan is not None:
         within("--scan", scan, 0, len(recording.times) - 1)
-    config = Config(lidar=recording.lidar, landmarks=LANDMARKS, confirm=CONFIRM)
+    config = logs.config_of_scans(recording.lidar)
     wheels = seen_from(recording.odometry[0], recording.odometry)
     with named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)
@@ -158,7 +160,10 @@ def run(
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
     with folder(out) as place:
         keep_compiled()
-        print(f"{log}: {len(wheels)} scans of {config.lidar.beams} beams", flush=True)
+        print(
+            f"{log}: {len(wheels)} scans of {config.lidar.beams} beams{recording.source}",
+            flush=True,
+        )
         with stopwatch() as seconds:
             moved = jnp.asarray(motions, float)
             aligned = logs.align(config, scans, motions) if by_scans else None
@@ -178,6 +183,7 @@ def run(
         if known is not None:
             numbers |= report.against_reference(recording.times, poses, known)
             lines["reference"], error = report.beside(recording.times, poses, known)
+            numbers["nees"] = report.nees_of(error, np.asarray(survey.info.pose_cov))
         if verified is not None:
             numbers |= report.against_relations(recording, poses, verified)
         numbers |= {"dead_reckoning": blind} if blind else {}

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.grid import GridSpec, centre_of, centres, seen_free
+from jaxslam.grid import GridSpec, cell_of, centre_of, seen_free
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.nodes import Nodes, NodeSpec
 from jaxslam.types import Array
@@ -20,6 +20,7 @@ from jaxslam.voronoi import Diagram, around, block_union, branches, expand, sing
 
 LINK_STEPS = 96  # cells that an id goes along a branch at most
 LINKS, FRONTIERS = 12, 6  # of a scan at most
+MEETS = 512  # cells at most in which ids meet, or branches end
 LINE = 9  # points K of a line
 FINE = 4  # finer than the points of its line is a link measured
 TWIN = 0.6  # [m] lines that are somewhere this far apart are two links, not one
@@ -90,18 +91,33 @@ class _Ids(NamedTuple):
     branch: Array  # (H, W) bool, cells of branches, one thick
 
 
-def _top(score: Array, count: int, reach: int) -> tuple[Array, Array]:
-    """Cells (count,) of the highest scores (H, W), `reach` cells apart, and which are finite."""
-    h, w = score.shape
+def _some(mask: Array) -> Array:
+    """Cells (MEETS,) int32 in which a mask (H, W) is True, H W for none."""
+    mask = lax.optimization_barrier(mask)  # which XLA would else work out anew for each of its sums
+    return jnp.nonzero(mask.reshape(-1), size=MEETS, fill_value=mask.size)[0].astype(jnp.int32)
+
+
+def _largest(cells: Array) -> Array:
+    """Largest (H, W) of each cell and the eight around it."""
+    p = jnp.pad(cells, ((1, 1), (0, 0)), mode="edge")
+    cells = jnp.maximum(jnp.maximum(p[:-2], p[2:]), cells)
+    p = jnp.pad(cells, ((0, 0), (1, 1)), mode="edge")
+    return jnp.maximum(jnp.maximum(p[:, :-2], p[:, 2:]), cells)
+
+
+def _top(score: Array, cells: Array, count: int, reach: int, width: int) -> tuple[Array, Array]:
+    """Of some cells (C,) the `count` with the highest scores (C,), and which are finite.
+
+    They are `reach` cells apart, in a grid of `width` columns.
+    """
 
     def step(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-        at = jnp.argmax(left).astype(jnp.int32)
-        square = (rows - at // w) ** 2 + (columns - at % w) ** 2
-        return jnp.where(square < reach**2, -jnp.inf, left), (at, left[at] > -jnp.inf)
+        at = jnp.argmax(left)
+        square = (rows - rows[at]) ** 2 + (columns - columns[at]) ** 2
+        return jnp.where(square < reach**2, -jnp.inf, left), (cells[at], left[at] > -jnp.inf)
 
-    rows, columns = jnp.indices((h, w), dtype=jnp.int32).reshape(2, -1)
-    _, (cell, valid) = lax.scan(step, score.reshape(-1), length=count)
-    return cell, valid
+    rows, columns = cells // width, cells % width
+    return lax.scan(step, score, length=count)[1]
 
 
 def find_links(
@@ -137,11 +153,7 @@ def find_links(
     place, valid = found.xy[: spec.nodes], found.valid[: spec.nodes]
     place = jnp.where(valid[:, None], place, 0.0)
     bit = id_bits(spec.nodes)
-    away = jnp.linalg.norm(centres(grid).astype(place.dtype)[None] - place[:, None, None], axis=-1)
-    near = (away < 2.5 * grid.cell) & valid[:, None, None]  # (N, H, W)
-    seeds = jnp.zeros(grid.shape, bit.dtype)
-    for k in range(spec.nodes):
-        seeds |= jnp.where(near[k], bit[k], jnp.zeros_like(bit[k]))
+    seeds = _seeds(place, valid, bit, grid)
     branch = branches(diagram, sources)
     thick = (block_union(branch.astype(jnp.uint8)) > 0) & (diagram.labels != 0) & ~sources
     met = expand(seeds, thick | (seeds != 0), steps=LINK_STEPS)
@@ -150,7 +162,7 @@ def find_links(
     unseen = (diagram.labels == 0) & ~sources & ~seen_free(scan, lidar, grid)
     wide = diagram.arrival > round(spec.least / grid.cell)  # steps, no fewer than cells to a wall
     reach = round(TWIN / grid.cell)
-    some = [_meets(ids, away, bit, reach), _ends(ids, unseen, wide, bit, reach)]
+    some = [_meets(ids, place, grid, bit, reach), _ends(ids, unseen, wide, bit, reach)]
     pair, cell, good = (jnp.concatenate(x) for x in zip(*some, strict=True))
     line, length, clearance = jax.vmap(_measure, in_axes=(0, 0, None, None, None, None, None))(
         pair, cell, ids, bit, place, grid, jnp.where(scan.hit[:, None], points(scan, lidar), 1e3)
@@ -162,7 +174,23 @@ def find_links(
     return Links(pair=pair, line=line, length=length, clearance=clearance, valid=good)
 
 
-def _meets(ids: _Ids, away: Array, bit: Array, reach: int) -> tuple[Array, Array, Array]:
+def _seeds(place: Array, valid: Array, bit: Array, grid: GridSpec) -> Array:
+    """Bit sets (H, W) of the ids of those junctions (N, 2) whose place is 2.5 cells off or less."""
+    beside = jnp.asarray(
+        np.stack(np.meshgrid(*[np.arange(-3, 4)] * 2), -1).reshape(-1, 2), jnp.int32
+    )
+    cell = cell_of(place, grid)[:, None] + beside[None]  # (N, 49, 2)
+    away = jnp.linalg.norm(centre_of(cell, grid).astype(place.dtype) - place[:, None], axis=-1)
+    near = (away < 2.5 * grid.cell) & valid[:, None] & jnp.all(cell >= 0, axis=-1)
+    row = jnp.where(near, cell[..., 0], grid.shape[0])
+    # No id comes twice to a cell: the sum of bits is their set.
+    own = jnp.broadcast_to(bit[:-1, None], row.shape)
+    return jnp.zeros(grid.shape, bit.dtype).at[row, cell[..., 1]].add(own, mode="drop")
+
+
+def _meets(
+    ids: _Ids, place: Array, grid: GridSpec, bit: Array, reach: int
+) -> tuple[Array, Array, Array]:
     """Where two ids meet: their pair (LINKS, 2), a cell (LINKS,), and whether there is one.
 
     Each pair may meet twice, in places that are far from each other.
@@ -172,17 +200,23 @@ def _meets(ids: _Ids, away: Array, bit: Array, reach: int) -> tuple[Array, Array
     for other in around(single(ids.own)):
         beside |= other
     both = ids.own | jnp.where(single(ids.own) != 0, beside, jnp.zeros_like(beside))
-    early = -ids.when.astype(away.dtype) - jnp.where(ids.branch, 0.0, 2.5).astype(away.dtype)
+    # Few cells hold two: all that follows is done on these.
+    where = _some((both & (both - 1)) != 0)
+    take = lambda x, fill: x.reshape(-1).at[where].get(mode="fill", fill_value=fill)
+    off_branch = jnp.where(take(ids.branch, False), 0.0, 2.5).astype(place.dtype)
+    early = -take(ids.when, 0).astype(place.dtype) - off_branch
+    held, width = take(both, 0), grid.shape[1]
+    middle = centre_of(jnp.stack([where // width, where % width], axis=-1), grid)
+    from_ids = jnp.linalg.norm(middle.astype(place.dtype)[None] - place[:, None], axis=-1)
     first, second = (jnp.asarray(k, jnp.int32) for k in np.triu_indices(len(bit) - 1, 1))
 
-    def meet(i: Array, j: Array) -> tuple[Array, Array, Array]:
+    def meet(i: Array, j: Array) -> tuple[Array, Array]:
         want = bit[i] | bit[j]
-        score = jnp.where(both & want == want, early - 1e-3 * (away[i] + away[j]), -jnp.inf)
-        cell, valid = _top(score, 2, reach)
-        return cell, valid, score.reshape(-1)[cell]
+        score = early - 1e-3 * (from_ids[i] + from_ids[j])
+        return _top(jnp.where(held & want == want, score, -jnp.inf), where, 2, reach, width)
 
-    cell, valid, score = (x.reshape(-1) for x in jax.vmap(meet)(first, second))
-    order = jnp.argsort(~valid | (score == -jnp.inf), stable=True)
+    cell, valid = (x.reshape(-1) for x in jax.vmap(meet)(first, second))
+    order = jnp.argsort(~valid, stable=True)
     order = jnp.resize(order, LINKS) if len(order) < LINKS else order[:LINKS]
     pair = jnp.repeat(jnp.stack([first, second], axis=1), 2, axis=0)
     return pair[order], cell[order], valid[order]
@@ -199,10 +233,16 @@ def _ends(
     around_it = block_union(block_union(ids.own))
     edge = block_union(block_union(jnp.pad(unseen, 1, constant_values=True).astype(jnp.uint8)))
     far = jnp.where(ids.when >= 0, 2 * ids.when + ids.branch.astype(jnp.int32), -1)
-    farthest = lax.reduce_window(far, jnp.int32(-1), lax.max, (7, 7), (1, 1), "SAME")
+    far = far.astype(jnp.int16)
+    farthest = far
+    for _ in range(3):
+        farthest = _largest(farthest)
     end = (own != 0) & (around_it == own) & (ids.when > 0) & (far == farthest)
     end &= (edge[1:-1, 1:-1] > 0) & wide
-    cell, valid = _top(jnp.where(end, far.astype(float), -jnp.inf), FRONTIERS, reach)
+    where = _some(end)
+    score = far.reshape(-1).at[where].get(mode="fill", fill_value=-1).astype(float)
+    score = jnp.where(where < far.size, score, -jnp.inf)
+    cell, valid = _top(score, where, FRONTIERS, reach, far.shape[1])
     node = jnp.argmax(own.reshape(-1)[cell][:, None] == bit[None, :-1], axis=1).astype(jnp.int32)
     return jnp.stack([node, jnp.full_like(node, -1)], axis=1), cell, valid
 

@@ -13,7 +13,7 @@ from jaxslam import alignment, lidar, slam
 from jaxslam.alignment import Aligned
 from jaxslam.batches import Spread
 from jaxslam.io.recording import Recording, Sightings
-from jaxslam.lidar import Scan
+from jaxslam.lidar import Lidar, Scan
 from jaxslam.metrics import match_times
 from jaxslam.monte_carlo import Log
 from jaxslam.nodes import Nodes, from_polar
@@ -21,6 +21,8 @@ from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.types import NODE
 
+LANDMARKS = 256  # room for those of a recorded log of scans
+CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
 PART = 0.01  # what a sighting's own standard deviation is of its range; `Noise.scale` times that
 
 
@@ -34,6 +36,11 @@ _LOOK = Spread(_look, size=slam.BATCH, static=1)
 def look(config: Config, scans: Scan) -> Nodes:
     """Features [T] of scans [T], NumPy arrays, with all devices."""
     return _LOOK(config, (), scans)
+
+
+def config_of_scans(lidar: Lidar) -> Config:
+    """What recorded logs of laser scans are filtered with unless told otherwise."""
+    return Config(lidar=lidar, landmarks=LANDMARKS, confirm=CONFIRM)
 
 
 def from_recording(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import lidar, mapping, metrics, slam
+from jaxslam import lidar, losses, mapping, metrics, slam
 from jaxslam.fit import Fit, names
 from jaxslam.io import geojson, graphml, occupancy, posegraph, tum
 from jaxslam.io.occupancy import Occupancy
@@ -69,6 +69,17 @@ def against_reference(times: np.ndarray, poses: np.ndarray, known: Trajectory) -
     turn = seen_from(seen_from(frame, known[1][j]), poses[i])[:, 2]
     numbers["heading_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(turn**2))))
     return numbers
+
+
+def nees_of(error: np.ndarray, cov: np.ndarray) -> float | None:
+    """Mean NEES per degree of freedom of errors (T, 3), those left out where NaN; None of none.
+
+    Poses that are known for certain, as the first is, are left out.
+    """
+    use = np.isfinite(error).all(axis=1) & (np.trace(cov, axis1=1, axis2=2) > losses.CERTAIN)
+    told = np.asarray(metrics.nees(jnp.asarray(error[use], float), jnp.asarray(cov[use], float)))
+    told = told[np.isfinite(told)]
+    return float(told.mean()) / 3.0 if told.size else None
 
 
 def against_relations(recording: Recording, poses: np.ndarray, verified: Relations) -> Numbers:

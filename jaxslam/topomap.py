@@ -25,6 +25,7 @@ ROOM = 0.4  # [m] around the end of a frontier that must be seen for it to be ex
 SKIN = 0.2  # [m] behind what was hit there is wall
 SAME_END = 1.0  # [m] ends of frontiers of one node this close are one
 CHORD = 0.3  # [m] between two ends from which their direction turns the line between them
+TWINS = 8  # arcs of the same ends that are compared with a link at most
 THROUGH = 0.5  # of its clearance: an arc this close to a node goes through it
 
 
@@ -144,19 +145,23 @@ def add(arcs: Arcs, ids: Array, pose: Array, links: Links, scan: Scan, lidar: Li
     good &= (ends[:, 0] != ends[:, 1]) & jnp.all(jnp.isfinite(line), axis=(1, 2))
     good &= ~repeated(ends, line, good)
 
-    # Every arc laid on every link, (P, A).
-    first = jnp.broadcast_to(line[:, None, 0], (line.shape[0], size, 2))
-    last = jnp.where(frontier[:, None, None], first + (arcs.line[:, -1] - arcs.line[:, 0])[None],
+    # The arcs with the ends of each link, (P, TWINS), laid on it.
+    alike = jnp.all(ends[:, None] == arcs.ends[None], axis=2) & (arcs.seen > 0)[None]
+    alike, other = lax.top_k(alike.astype(line.dtype), min(TWINS, size))
+    old = arcs.line[other]
+    first = jnp.broadcast_to(line[:, None, 0], (*other.shape, 2))
+    last = jnp.where(frontier[:, None, None], first + old[:, :, -1] - old[:, :, 0],
                      jnp.broadcast_to(line[:, None, -1], first.shape))  # fmt: skip
-    laid = jax.vmap(attach, in_axes=(None, 0, 0))(arcs.line, first, last)
+    laid = attach(old, first, last)
     off = jnp.where(
         frontier[:, None],
         jnp.linalg.norm(laid[:, :, -1] - line[:, None, -1], axis=-1) * (TWIN / SAME_END),
         gap(laid, line[:, None]),
     )
-    same = jnp.all(ends[:, None] == arcs.ends[None], axis=2) & (arcs.seen > 0)[None] & (off < TWIN)
+    same = (alike > 0.0) & (off < TWIN)
     known = jnp.any(same, axis=1)
-    best = jnp.argmin(jnp.where(same, off, jnp.inf), axis=1).astype(jnp.int32)
+    nearest = jnp.argmin(jnp.where(same, off, jnp.inf), axis=1)[:, None]
+    best = jnp.take_along_axis(other, nearest, axis=1)[:, 0].astype(jnp.int32)
     # Two links on one arc: the nearer counts.
     rival = (best[:, None] == best[None]) & (known & good)[None] & known[:, None]
     mine = jnp.min(jnp.where(same, off, jnp.inf), axis=1)
@@ -170,7 +175,8 @@ def add(arcs: Arcs, ids: Array, pose: Array, links: Links, scan: Scan, lidar: Li
     part = jnp.where(known, 1.0 / (arcs.seen[at] + 1).astype(line.dtype), 1.0)
     longer = (links.length > arcs.length[at]).astype(line.dtype)
     part = jnp.where(frontier & known, longer, part)
-    before = jnp.where(known[:, None, None], laid[jnp.arange(slot.size), at], line)
+    own = jnp.take_along_axis(laid, nearest[:, :, None, None], axis=1)[:, 0]
+    before = jnp.where(known[:, None, None], own, line)
     narrow = jnp.where(known, arcs.clearance[at], jnp.inf)
     mix = lambda old, new, w: old + w * (new - old)
     changes = Arcs(

@@ -28,8 +28,6 @@ from jaxslam.options import keep_compiled, named, noise_of, stopwatch, within
 from jaxslam.slam import Config, Noise
 from jaxslam.world import World
 
-LANDMARKS = 256  # room for those of a recorded log of scans
-CONFIRM = 3  # sightings from which one counts there
 NOISE, CHECKPOINT = "noise.json", "tune.npz"
 
 
@@ -194,7 +192,7 @@ def _recorded(
         if other:
             problem = f"has another scanner than {logs[0]}"
             raise InputError(problem, path=(*logs, *test)[other[0]], advice="tune them apart")
-        config = Config(lidar=every[0].lidar, landmarks=LANDMARKS, confirm=CONFIRM)
+        config = log_of.config_of_scans(every[0].lidar)
         pairs = list(zip(every, known, strict=True))
         for path, (one, poses) in zip(reference, pairs, strict=False):
             if not metrics.match_times(one.times, poses[0]).size:

@@ -216,7 +216,15 @@ def add_driven(
         lengths = np.array([w.length for w in known])
         lines = [w.line for w in known]
         # An arc that the drive did not keep beside is none that it followed.
-        close = np.array([beside(line, way.line)[0].max() < room for line in lines], bool)
+        low, high = way.line.min(axis=0) - room, way.line.max(axis=0) + room
+        inside = [(low <= line).all() and (line <= high).all() for line in lines]
+        close = np.array(
+            [
+                near and beside(line, way.line)[0].max() < room
+                for near, line in zip(inside, lines, strict=True)
+            ],
+            bool,
+        )
         try:
             arcs = shortest(
                 pairs, np.where(close, lengths, np.inf), way.a, way.b, places=len(clearance)
@@ -240,11 +248,14 @@ def still_open(
         clearance: (N,) [m] of the nodes.
     """
     found: list[Way] = []
+    low = np.array([w.line.min(axis=0) for w in known]).reshape(-1, 2)
+    high = np.array([w.line.max(axis=0) for w in known]).reshape(-1, 2)
     for way in sorted(frontiers, key=lambda way: way.length):
         end, reach = way.line[-1:], min(LYING, way.length / 2)
         on_node = np.linalg.norm(xy - end, axis=1) < clearance / 2
         on_node[way.a] = False
-        lines = [w.line for w in known]
+        about = ((low - reach <= end) & (end <= high + reach)).all(axis=1)
+        lines = [known[k].line for k in np.flatnonzero(about)]
         taken = any(beside(end, line)[0][0] < reach for line in lines)
         twice = any(np.linalg.norm(w.line[-1] - end[0]) < LYING for w in found)
         if not (on_node.any() or taken or twice):

@@ -38,7 +38,7 @@ def test_beams_end_in_occupied_cells_and_pass_free_ones(found):
             cells.append((found.occupied[tuple(at.T)], found.free[tuple(at.T)]))
     # Where beams graze a wall, more pass a cell than end in it.
     assert np.concatenate([one[0] for one in ended]).mean() > 0.94
-    assert np.concatenate([one[1] for one in passed]).mean() > 0.99
+    assert np.concatenate([one[1] for one in passed]).mean() > 0.95
     assert not (found.occupied & found.free).any()
     assert not (found.occupied | found.free)[[0, -1]].any()  # a margin of unknown cells
 

@@ -193,6 +193,7 @@ def _recording(path: str | PathLike, bag: Any, chosen: Choice, reach: float) -> 
         skipped=left,
         wheel_times=stream[:, 0],
         wheel_poses=poses,
+        source=f", scans of {chosen.scans}, odometry of {chosen.odometry}",
     )
 
 

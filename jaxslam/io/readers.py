@@ -31,18 +31,31 @@ class Known(NamedTuple):
 KNOWN = {"killian": Known("rtbdata", "data", ("data", "killian.g2o.zip"))}
 
 
-def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
+def read(
+    path: str | PathLike,
+    *,
+    reach: float = REACH,
+    scans: str | None = None,
+    odometry: str | None = None,
+) -> Recording:
     """Read a log: CARMEN's, a bag of ROS, a pose graph of g2o with scans, a recording of `npz`.
 
     Args:
         path: The log, or the name of one of `KNOWN`.
         reach: Range [m] from which on a reading counts as no return.
+        scans: Topic of the laser scans in a bag.
+        odometry: Topic of the odometry in a bag, or of the transforms.
 
     Raises:
-        InputError: The log is of no known form, or as its reader says.
+        InputError: The log is of no known form, or has no topics, or as its reader says.
     """
     path = find(path)
-    return reader_of(path).read(path, reach=reach)
+    reader = reader_of(path)
+    if reader is bags:
+        return bags.read(path, reach=reach, scans=scans, odometry=odometry)
+    if scans is not None or odometry is not None:
+        raise InputError("has no topics", path=path, advice="name topics of bags only")
+    return reader.read(path, reach=reach)
 
 
 def find(path: str | PathLike) -> Path:

@@ -26,6 +26,7 @@ class Recording(NamedTuple):
     skipped: int  # broken lines left out
     wheel_times: np.ndarray  # (N,) float64 [s] of the whole stream of wheel poses
     wheel_poses: np.ndarray  # (N, 3) float64 [m, m, rad]; the scans' own if there is no stream
+    source: str = ""  # what of the log it is, where there was a choice
     mended: tuple[str, ...] = ()  # what was wrong with the odometry, and is put right here
 
 

@@ -1,0 +1,275 @@
+"""Recorded logs: what aligned scans, each kind of landmark and tuned noise are worth.
+
+Every log in the folder `--data`, and MIT's Killian Court where `.[data]` is installed, by one set
+of defaults. `NAME.reference.tum` and `NAME.relations` beside `NAME.clf` are what it is judged by.
+Odometry is that of the wheels, or of scans aligned to those before and fused with the wheels. Tuned
+noise is tuned on the other logs that have a reference, never on the one it is judged on. NEES is
+that of errors since the first scan. References are made by other programs: some centimetres of an
+error are theirs.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from experiments import common, one_core
+from jaxslam import alignment, fit, lidar, logs, monte_carlo, report, slam
+from jaxslam.io import readers, relations, tum
+from jaxslam.io.errors import InputError
+from jaxslam.io.recording import Recording
+from jaxslam.io.relations import Relations
+from jaxslam.metrics import match_times
+from jaxslam.monte_carlo import Log
+from jaxslam.nodes import restrict
+from jaxslam.noise import Noise, log_noise
+from jaxslam.options import keep_compiled
+from jaxslam.poses import seen_from
+from jaxslam.slam import Config
+from jaxslam.types import CORNER, NODE, WALL
+
+NAME = "real_logs"
+SUFFIXES = (".clf", ".log", ".gz", ".g2o", ".zip", ".bag", ".npz")
+LANDMARKS = {
+    "none": (),
+    "nodes": (NODE,),
+    "nodes+corners": (NODE, CORNER),
+    "all": (NODE, CORNER, WALL),
+}
+ODOMETRY = ("wheels", "scan")
+STEPS = 12  # of tuning
+
+
+class Known(NamedTuple):
+    """A log, and what is known of the way of its robot."""
+
+    name: str
+    recording: Recording
+    reference: report.Trajectory | None
+    relations: Relations | None
+
+
+class Seen(NamedTuple):
+    """What the filter is given of a log."""
+
+    config: Config
+    log: Log  # with its motions aligned; the truth is the reference since the first scan
+    ms: dict[str, float]  # a scan, one core, of the front end, the alignment, and each filter
+
+
+def find(folder: Path | None) -> list[Known]:
+    """The logs of a folder, and those that packages bring."""
+    files = sorted(folder.rglob("*")) if folder else []
+    paths = {
+        path.name.split(".")[0]: path
+        for path in files
+        if path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
+    }
+    for name in readers.KNOWN:
+        try:
+            paths[name] = readers.find(name)
+        except InputError as error:
+            print(f"left out: {error}")
+
+    def beside(name: str, ending: str) -> Path | None:
+        own = [file for file in files if file.name.endswith(f"{name}{ending}")]
+        return own[0] if own else None
+
+    found = []
+    for name, path in paths.items():
+        reference, pairs = beside(name, ".reference.tum"), beside(name, ".relations")
+        one = Known(
+            name,
+            readers.read(path),
+            None if reference is None else tum.read(reference),
+            None if pairs is None else relations.read(pairs),
+        )
+        found.append(one)
+    return found
+
+
+def look(known: Known) -> Seen:
+    """Features and aligned motions of a log, and what they and the filter cost on one core."""
+    recording = known.recording
+    config = logs.config_of_scans(recording.lidar)
+    motion = jnp.asarray(logs.motions(recording.odometry), float)
+    scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
+    align = lambda: alignment.odometry(config.alignment, config.lidar, scans, motion)
+    truth, judged = np.zeros(motion.shape, np.float32), np.zeros(len(motion), bool)
+    if known.reference is not None:
+        i, j = match_times(recording.times, known.reference[0]).T
+        truth[i] = seen_from(known.reference[1][j[0]], known.reference[1][j])
+        judged[i] = True
+    nodes, _ = slam.local_maps(config, scans)
+    log = jax.tree.map(np.asarray, Log(truth, motion, nodes, None, judged, aligned=align()))
+    calls: dict[str, tuple] = {"front_end": (slam.local_maps, config, scans), "alignment": (align,)}
+    for odometry in ODOMETRY:
+        inputs = monte_carlo.inputs_of(given(log, odometry, "all"))
+        start = slam.init(config, jnp.zeros(3))
+        calls[odometry] = slam.run, config, log_noise(aligned=odometry == "scan"), start, inputs
+    one_core.pin()
+    taken = one_core.least(calls, repeats=2)
+    one_core.unpin()
+    return Seen(config, log, {name: 1e3 * s / len(motion) for name, s in taken.items()})
+
+
+def given(log: Log, odometry: str, landmarks: str) -> Log:
+    """The log with some kinds of landmarks, and with its motions aligned or not."""
+    kinds = jnp.array(LANDMARKS[landmarks] or (-1,), jnp.int32)
+    some = jax.vmap(restrict)(log.nodes, jnp.isin(log.nodes.kind, kinds))
+    aligned = log.aligned if odometry == "scan" else None
+    return log._replace(nodes=jax.tree.map(np.asarray, some), aligned=aligned)
+
+
+def tuned(others: Sequence[Seen], odometry: str) -> dict[str, Any] | None:
+    """Noise tuned on the logs that have a reference; None if there are none."""
+    some = [one for one in others if one.log.judged.any()]
+    if not some:
+        return None
+    together = logs.stack([given(one.log, odometry, "all") for one in some])
+    with tqdm(total=STEPS + 1, unit="step", leave=False, desc=f"tuning, {odometry}") as bar:
+        start = log_noise(aligned=odometry == "scan")
+        report = lambda _: bar.update()
+        # The filter asks of the scanner no more than its field of view.
+        found = fit.tune(start, some[0].config, together, steps=STEPS, report=report)
+    return found.noise._asdict()
+
+
+def row(
+    known: Known, seen: Seen, odometry: str, landmarks: str, noise: Noise
+) -> tuple[common.Numbers, np.ndarray]:
+    """Errors of one way to do it, and the estimated positions (T, 2)."""
+    log = given(seen.log, odometry, landmarks)
+    start = slam.init(seen.config, jnp.zeros(3))
+    belief, info = slam.run(seen.config, noise, start, monte_carlo.inputs_of(log))
+    poses = np.asarray(info.pose, np.float64)
+    ms = seen.ms["front_end"] + seen.ms[odometry]
+    numbers: common.Numbers = dict.fromkeys(("ate_rmse_m", "relations_translation_m", "nees"))
+    numbers["landmarks_confirmed"] = int(
+        np.sum(np.asarray(belief.seen >= slam.needed(seen.config, belief.kind)))
+    )
+    numbers["ms_per_scan"] = ms + (seen.ms["alignment"] if odometry == "scan" else 0.0)
+    if known.reference is not None:
+        told = report.against_reference(known.recording.times, poses, known.reference)
+        error = np.where(log.judged[:, None], report.error_of(poses, log.truth), np.nan)
+        numbers["ate_rmse_m"] = told["ate_rmse_m"]
+        numbers["nees"] = report.nees_of(error, np.asarray(info.pose_cov))
+    if known.relations is not None:
+        told = report.against_relations(known.recording, poses, known.relations)["relations"]
+        numbers["relations_translation_m"] = told["translation_mean_m"]
+        numbers["relations_rotation_deg"] = told["rotation_mean_deg"]
+    return numbers, poses[:, :2]
+
+
+def compute(folder: Path | None, tune: bool, kept: common.Kept) -> common.Numbers:
+    """Rows of all logs, and the ways that are drawn.
+
+    Raises:
+        InputError: There is no log, or one cannot be read.
+    """
+    known = find(folder)
+    if not known:
+        raise InputError("no log", advice="give --data FOLDER, or pip install '.[data]'")
+    seen = [look(one) for one in tqdm(known, unit="log", desc="looking")]
+    rows, ways = [], {}
+    for k, (one, own) in enumerate(zip(known, seen, strict=True)):
+        wheels = seen_from(one.recording.odometry[0], one.recording.odometry)
+        ways[one.name] = {"wheels": wheels[:, :2]}
+        if own.log.judged.any():
+            ways[one.name]["reference"] = own.log.truth[own.log.judged, :2]
+        for odometry in ODOMETRY:
+            noises = {"default": log_noise(aligned=odometry == "scan")}
+            others = [*seen[:k], *seen[k + 1 :]]
+            make = lambda others=others, odometry=odometry: {"noise": tuned(others, odometry)}
+            found = kept(f"{one.name} {odometry}", make)["noise"] if tune else None
+            if found is not None:
+                values = {name: x and jnp.asarray(x, float) for name, x in found.items()}
+                noises["tuned"] = Noise(**values)
+            for landmarks in LANDMARKS:
+                for name, noise in noises.items():
+                    numbers, way = row(one, own, odometry, landmarks, noise)
+                    about = {"log": one.name, "odometry": odometry, "landmarks": landmarks}
+                    rows.append(about | {"noise": name} | numbers)
+                    if (odometry, landmarks, name) == ("scan", "all", "default"):
+                        ways[one.name]["estimate"] = way
+        for shown in rows[-4 * len(noises) :]:
+            print(line(shown), flush=True)
+    ms = {one.name: own.ms for one, own in zip(known, seen, strict=True)}
+    return {"rows": rows, "ms_per_scan": ms, "ways": ways}
+
+
+def line(row: common.Numbers) -> str:
+    """A row as text."""
+    text = f"{row['log']:14} {row['odometry']:7} {row['landmarks']:14} {row['noise']:8}"
+    units = {"ate_rmse_m": "m ATE", "relations_translation_m": "m relations", "nees": "NEES"}
+    told = [f"{row[key]:8.3f} {unit}" for key, unit in units.items() if row[key] is not None]
+    return f"{text}{'  '.join(told)}  {row['ms_per_scan']:.1f} ms"
+
+
+def draw(numbers: common.Numbers, path: Path) -> None:
+    """The way of each log, and the errors of all its rows."""
+    ways = numbers["ways"]
+    figure, axes = common.canvas(13, 4.6 * len(ways), len(ways), 2)
+    styles = {
+        "reference": {"color": common.BLACK, "linestyle": "--", "linewidth": 1.0, "zorder": 3},
+        "estimate": {"color": common.SKY, "linewidth": 2.5},
+        "wheels": {"color": common.RED, "linestyle": ":", "linewidth": 0.8},
+    }
+    for (left, right), (name, own) in zip(axes, ways.items(), strict=True):
+        for what, style in styles.items():
+            if what in own:
+                left.plot(*np.array(own[what], float).T, label=what, **style)
+        close = np.concatenate([np.array(own[what]) for what in own if what != "wheels"])
+        low, high = close.min(axis=0) - 3.0, close.max(axis=0) + 3.0
+        left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        left.set(xlabel="x [m]", ylabel="y [m]", title=name)
+        left.legend(fontsize="small")
+        _draw_rows(right, [row for row in numbers["rows"] if row["log"] == name])
+    figure.savefig(path)
+
+
+def _draw_rows(axis: Any, rows: list[common.Numbers]) -> None:
+    key = "ate_rmse_m" if rows[0]["ate_rmse_m"] is not None else "relations_translation_m"
+    colours = {"wheels": common.RED, "scan": common.BLUE}
+    for odometry, colour in colours.items():
+        for noise, marker in (("default", "o"), ("tuned", "^")):
+            some = [row for row in rows if (row["odometry"], row["noise"]) == (odometry, noise)]
+            if some:
+                names = [row["landmarks"] for row in some]
+                style = {"color": colour, "fillstyle": "full" if noise == "default" else "none"}
+                label = f"{odometry}, {noise} noise"
+                axis.plot(names, [row[key] for row in some], marker + "-", label=label, **style)
+    axis.set(yscale="log", xlabel="landmarks")
+    axis.set_ylabel("ATE RMSE [m]" if key == "ate_rmse_m" else "mean error of relations [m]")
+    common.plain_log(axis)
+    axis.legend(fontsize="small")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
+    options = common.parse(__doc__, argv, data="", tune=1)
+    keep_compiled()
+    kept = common.Kept(options.out / f"{NAME}_parts", {"data": options.data})
+    try:
+        folder = Path(options.data) if options.data else None
+        if folder is not None and not folder.is_dir():
+            raise InputError("is no folder", path=folder, advice="name the folder of the logs")
+        numbers = compute(folder, bool(options.tune), kept)
+    except InputError as error:
+        print(f"{NAME}: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
+        return 130
+    common.save(options.out, NAME, {"seed": options.seed} | numbers, draw)
+    kept.clear()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -96,7 +96,7 @@ def find(folder: Path | None) -> list[Known]:
 def look(known: Known) -> Seen:
     """Features and aligned motions of a log, and what they and the filter cost on one core."""
     recording = known.recording
-    config = logs.config_of_scans(recording.lidar)
+    config = logs.config_of_scans([recording])
     motion = jnp.asarray(logs.motions(recording.odometry), float)
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
     align = lambda: alignment.odometry(config.alignment, config.lidar, scans, motion)

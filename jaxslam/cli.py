@@ -150,7 +150,7 @@ def run(
     assumed = noise_of(noise, slam.log_noise(aligned=by_scans))
     if scan is not None:
         within("--scan", scan, 0, len(recording.times) - 1)
-    config = logs.config_of_scans(recording.lidar)
+    config = logs.config_of_scans([recording])
     wheels = seen_from(recording.odometry[0], recording.odometry)
     with named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)

@@ -176,9 +176,7 @@ def find_links(
 
 def _seeds(place: Array, valid: Array, bit: Array, grid: GridSpec) -> Array:
     """Bit sets (H, W) of the ids of those junctions (N, 2) whose place is 2.5 cells off or less."""
-    beside = jnp.asarray(
-        np.stack(np.meshgrid(*[np.arange(-3, 4)] * 2), -1).reshape(-1, 2), jnp.int32
-    )
+    beside = jnp.asarray(np.indices((7, 7)).reshape(2, -1).T - 3, jnp.int32)
     cell = cell_of(place, grid)[:, None] + beside[None]  # (N, 49, 2)
     away = jnp.linalg.norm(centre_of(cell, grid).astype(place.dtype) - place[:, None], axis=-1)
     near = (away < 2.5 * grid.cell) & valid[:, None] & jnp.all(cell >= 0, axis=-1)

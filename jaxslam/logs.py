@@ -3,6 +3,7 @@
 Logs of NumPy arrays, one run each or, stacked, of B runs that lead them.
 """
 
+import math
 from collections.abc import Sequence
 
 import jax
@@ -13,7 +14,7 @@ from jaxslam import alignment, lidar, slam
 from jaxslam.alignment import Aligned
 from jaxslam.batches import Spread
 from jaxslam.io.recording import Recording, Sightings
-from jaxslam.lidar import Lidar, Scan
+from jaxslam.lidar import Scan
 from jaxslam.metrics import match_times
 from jaxslam.monte_carlo import Log
 from jaxslam.nodes import Nodes, from_polar
@@ -21,7 +22,8 @@ from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.types import NODE
 
-LANDMARKS = 256  # room for those of a recorded log of scans
+ROOM = 256, 1024  # landmarks that there is room for in a log of scans: at least, at most
+SPARSE = 2.0  # [m] of the way for which there is room for a landmark, in between
 CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
 PART = 0.01  # what a sighting's own standard deviation is of its range; `Noise.scale` times that
 
@@ -38,9 +40,16 @@ def look(config: Config, scans: Scan) -> Nodes:
     return _LOOK(config, (), scans)
 
 
-def config_of_scans(lidar: Lidar) -> Config:
-    """What recorded logs of laser scans are filtered with unless told otherwise."""
-    return Config(lidar=lidar, landmarks=LANDMARKS, confirm=CONFIRM)
+def config_of_scans(recordings: Sequence[Recording]) -> Config:
+    """What logs of laser scans, all by the same scanner, are filtered with unless told otherwise.
+
+    There is room for the landmarks of the longest way: a power of two.
+    """
+    ways = [np.hypot(*np.diff(one.odometry[:, :2], axis=0).T).sum() for one in recordings]
+    least, most = ROOM
+    room = 2 ** math.ceil(math.log2(max(max(ways) / SPARSE, 1.0)))
+    lidar = recordings[0].lidar
+    return Config(lidar=lidar, landmarks=min(max(room, least), most), confirm=CONFIRM)
 
 
 def from_recording(

@@ -192,7 +192,7 @@ def _recorded(
         if other:
             problem = f"has another scanner than {logs[0]}"
             raise InputError(problem, path=(*logs, *test)[other[0]], advice="tune them apart")
-        config = log_of.config_of_scans(every[0].lidar)
+        config = log_of.config_of_scans(every)
         pairs = list(zip(every, known, strict=True))
         for path, (one, poses) in zip(reference, pairs, strict=False):
             if not metrics.match_times(one.times, poses[0]).size:

@@ -22,8 +22,8 @@ from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.types import NODE
 
-ROOM = 256, 1024  # landmarks that there is room for in a log of scans: at least, at most
-SPARSE = 2.0  # [m] of the way for which there is room for a landmark, in between
+ROOM = 384, 1024  # landmarks that there is room for in a log of scans: at least, at most
+SPARSE = 2.5  # [m] of the way for which there is room for a landmark, in between
 CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
 PART = 0.01  # what a sighting's own standard deviation is of its range; `Noise.scale` times that
 
@@ -43,11 +43,11 @@ def look(config: Config, scans: Scan) -> Nodes:
 def config_of_scans(recordings: Sequence[Recording]) -> Config:
     """What logs of laser scans, all by the same scanner, are filtered with unless told otherwise.
 
-    There is room for the landmarks of the longest way: a power of two.
+    There is room for the landmarks of the longest way, in steps of 128.
     """
     ways = [np.hypot(*np.diff(one.odometry[:, :2], axis=0).T).sum() for one in recordings]
     least, most = ROOM
-    room = 2 ** math.ceil(math.log2(max(max(ways) / SPARSE, 1.0)))
+    room = 128 * math.ceil(max(ways) / SPARSE / 128)
     lidar = recordings[0].lidar
     return Config(lidar=lidar, landmarks=min(max(room, least), most), confirm=CONFIRM)
 

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import test_bags
 import test_g2o
 import test_npz
 
@@ -37,6 +38,16 @@ def test_readings_from_the_reach_on_are_none(files):
     for name in "abcd":
         found = readers.read(files / name, reach=2.5)
         assert found.lidar.reach == 2.5 and np.isinf(found.ranges).any()
+
+
+def test_topics_are_those_of_bags(files, tmp_path):
+    with pytest.raises(InputError, match="has no topics; name topics of bags only"):
+        readers.read(files / "a", scans="/scan")
+    bag = test_bags.write(tmp_path / "drive.bag", 1)
+    found = readers.read(bag, scans="/scan", odometry="/odom")
+    assert found.source == ", scans of /scan, odometry of /odom"
+    with pytest.raises(InputError, match="'/s'"):
+        readers.read(bag, scans="/s")
 
 
 @pytest.mark.parametrize(

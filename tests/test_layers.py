@@ -1,4 +1,6 @@
 import ast
+import tomllib
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -62,3 +64,12 @@ def test_modules_import_only_what_comes_before(path):
 def test_only_plot_imports_matplotlib(path):
     drawn = [name for name in imported(path.read_text()) if name.split(".")[0] == "matplotlib"]
     assert not drawn or layer(path) == "plot"
+
+
+def test_all_packages_are_installed():
+    """The tests run on the sources, where a package that is left out of the wheel is not missed."""
+    told = tomllib.loads((HOME.parent / "pyproject.toml").read_text())
+    include = told["tool"]["setuptools"]["packages"]["find"]["include"]
+    packages = [file.parent.relative_to(HOME.parent) for file in HOME.rglob("__init__.py")]
+    names = [".".join(path.parts) for path in packages]
+    assert len(names) >= 3 and all(any(fnmatch(n, x) for x in include) for n in names)

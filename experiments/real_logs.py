@@ -195,10 +195,9 @@ def compute(folder: Path | None, tune: bool, kept: common.Kept) -> common.Number
                     numbers, way = row(one, own, odometry, landmarks, noise)
                     about = {"log": one.name, "odometry": odometry, "landmarks": landmarks}
                     rows.append(about | {"noise": name} | numbers)
+                    print(line(rows[-1]), flush=True)
                     if (odometry, landmarks, name) == ("scan", "all", "default"):
                         ways[one.name]["estimate"] = way
-        for shown in rows[-4 * len(noises) :]:
-            print(line(shown), flush=True)
     ms = {one.name: own.ms for one, own in zip(known, seen, strict=True)}
     return {"rows": rows, "ms_per_scan": ms, "ways": ways}
 

@@ -150,9 +150,7 @@ def row(
     poses = np.asarray(info.pose, np.float64)
     ms = seen.ms["front_end"] + seen.ms[odometry]
     numbers: common.Numbers = dict.fromkeys(("ate_rmse_m", "relations_translation_m", "nees"))
-    numbers["landmarks_confirmed"] = int(
-        np.sum(np.asarray(belief.seen >= slam.needed(seen.config, belief.kind)))
-    )
+    numbers["landmarks_confirmed"] = int(np.sum(slam.confirmed(seen.config, belief)))
     numbers["ms_per_scan"] = ms + (seen.ms["alignment"] if odometry == "scan" else 0.0)
     if known.reference is not None:
         told = report.against_reference(known.recording.times, poses, known.reference)

@@ -234,10 +234,10 @@ def align(
     sure = jnp.diag(1.0 / jnp.stack([unsure[0], unsure[0], unsure[1]]))
     wheels_say = guess, sure
 
-    age = (local.held - 1 - jnp.arange(spec.scans, dtype=jnp.int32)) % spec.scans
-    last = jnp.argsort(age)[: spec.recent]
-    few = jax.tree.map(lambda x: x[last], (local.surfaces, local.poses))
-    few = local._replace(surfaces=few[0], poses=few[1])
+    back = jnp.arange(min(spec.recent, spec.scans), dtype=jnp.int32)
+    last = (local.held - 1 - back) % spec.scans
+    some = lambda x: x[last]
+    few = local._replace(surfaces=jax.tree.map(some, local.surfaces), poses=some(local.poses))
     thin = slice(None, None, spec.thin)
     starts = guess[None] + jnp.array([[0.0, 0.0, turn] for turn in spec.turns])
     find = lambda start: _descend(

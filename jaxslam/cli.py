@@ -175,7 +175,7 @@ def run(
             "mended": recording.mended,
             "odometry": odometry,
             "path_length_m": report.length(poses if by_scans else wheels),
-            "landmarks": int(np.sum(survey.belief.seen >= slam.needed(config, survey.belief.kind))),
+            "landmarks": int(np.sum(slam.confirmed(config, survey.belief))),
             "matches": float(np.mean(np.sum(np.asarray(survey.info.used), axis=1))),
             "seconds": seconds,
         }

@@ -10,6 +10,7 @@ from tqdm import tqdm
 from jaxslam import lidar, slam
 from jaxslam.lidar import Scan
 from jaxslam.noise import Noise
+from jaxslam.poses import placed
 from jaxslam.slam import Config, Inputs
 
 FRAMES = 100
@@ -50,7 +51,7 @@ def film(
     hit = np.asarray(scans.hit)
     belief, poses = slam.init(config, jnp.asarray(odometry[0], float)), np.zeros((0, 3))
     far = [beams[k][hit[k]] for k in range(count)]
-    shown = [_placed(pose, ends) for pose, ends in zip(way, far, strict=True) if len(ends)]
+    shown = [placed(pose, ends) for pose, ends in zip(way, far, strict=True) if len(ends)]
     figure, axis = plot.plan(*plot.extent(way, *shown))
     look = {"xlim": axis.get_xlim(), "ylim": axis.get_ylim(), "aspect": "equal"}
     look |= {"xlabel": "x [m]", "ylabel": "y [m]"}
@@ -74,9 +75,3 @@ def film(
 
     with tqdm(total=frames, unit="frame", desc="film") as bar:
         plot.film(path, figure, draw, frames)
-
-
-def _placed(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (N, 2) of the robot frame in the world, NumPy."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return points @ np.array([[c, s], [-s, c]]) + pose[:2]

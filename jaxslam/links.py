@@ -93,7 +93,6 @@ class _Ids(NamedTuple):
 
 def _some(mask: Array) -> Array:
     """Cells (MEETS,) int32 in which a mask (H, W) is True, H W for none."""
-    mask = lax.optimization_barrier(mask)  # which XLA would else work out anew for each of its sums
     return jnp.nonzero(mask.reshape(-1), size=MEETS, fill_value=mask.size)[0].astype(jnp.int32)
 
 

@@ -83,7 +83,7 @@ def pose_graph(config: Config, noise: Noise, survey: Survey, inputs: Inputs) -> 
         inputs: [T] it was given.
     """
     belief, info = survey.belief, survey.info
-    kept = (belief.seen >= slam.needed(config, belief.kind)) & (belief.kind != WALL)
+    kept = slam.confirmed(config, belief) & (belief.kind != WALL)
     names = np.asarray(belief.id)[np.asarray(kept)]
     seen_by, feature = np.nonzero(np.isin(np.asarray(info.id), names) & (np.asarray(info.id) >= 0))
     rank = {name: k for k, name in enumerate(names.tolist())}

@@ -178,7 +178,7 @@ def track(config: Config, noise: Noise, log: Log) -> Track:
         cov=info.pose_cov,
         odometry=dead_reckoning(log.truth[0], log.motion),
         matches=jnp.sum(info.used, axis=1, dtype=jnp.int32),
-        landmarks=jnp.sum(belief.seen >= slam.needed(config, belief.kind), dtype=jnp.int32),
+        landmarks=jnp.sum(slam.confirmed(config, belief), dtype=jnp.int32),
         finite=jnp.all(info.finite),
         judged=jnp.ones(len(log.truth), bool) if log.judged is None else log.judged,
         length=jnp.int32(len(log.truth)) if log.length is None else log.length,

@@ -31,6 +31,13 @@ def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return np.stack([x, y, _wrap(d[..., 2])], axis=-1)
 
 
+def placed(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (..., 2) of the frames of poses (..., 3), in the world; as `geometry.to_world`."""
+    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([poses[..., 0] + c * x - s * y, poses[..., 1] + s * x + c * y], axis=-1)
+
+
 def chain(moves: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Poses (N + 1, 3) from a start (3,), zero by default, by moves (N, 3) in the frame before."""
     poses = np.zeros((len(moves) + 1, 3))

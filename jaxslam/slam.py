@@ -148,6 +148,11 @@ def needed(config: Config, kind: Array) -> Array:
     return jnp.where(kind == WALL, config.wall_confirm, config.confirm)
 
 
+def confirmed(config: Config, belief: Belief) -> Array:
+    """Landmarks (L,) bool that count."""
+    return belief.seen >= needed(config, belief.kind)
+
+
 def _outlive(
     config: Config, belief: Belief, slot: Array, looked: Array
 ) -> tuple[Belief, Array, Array]:
@@ -166,8 +171,7 @@ def _outlive(
     view = lidar.first, lidar.first + lidar.step * (lidar.beams - 1)
     due = overdue(belief, view) & (belief.last < belief.step) & looked
     belief = belief._replace(missed=jnp.where(due, belief.missed + 1, belief.missed))
-    confirmed = belief.seen >= needed(config, belief.kind)
-    gone = ~confirmed & (belief.step - belief.last > config.patience)
+    gone = ~confirmed(config, belief) & (belief.step - belief.last > config.patience)
     gone = (gone | (belief.missed >= config.misses)) & (belief.seen > 0)
     belief = forget(belief, gone)
     one = slot[belief.step % slot.size]
@@ -243,7 +247,6 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
         after, forgotten, merged = _outlive(config, after, matched, jnp.any(seen.valid))
     else:
         forgotten = merged = jnp.int32(0)
-    confirmed = after.seen >= needed(config, after.kind)
     held = after.seen
     after, fresh = ekf.augment(
         after,
@@ -252,7 +255,7 @@ def step(config: Config, noise: Noise, belief: Belief, inputs: Inputs) -> tuple[
         features.new & finite,
         most=config.fresh,
         at=features.at,
-        worth=worth(after, confirmed, idle=config.idle),
+        worth=worth(after, confirmed(config, after), idle=config.idle),
         **how,
     )
     evicted = jnp.sum(held.at[fresh].get(mode="fill", fill_value=0) > 0, dtype=jnp.int32)

@@ -14,6 +14,7 @@ from jaxslam.grid import GridSpec
 from jaxslam.io.occupancy import Occupancy
 from jaxslam.nodes import Nodes
 from jaxslam.plot.sheet import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SIGMAS, SKY, YELLOW
+from jaxslam.poses import placed
 from jaxslam.topomap import Graph
 from jaxslam.types import CORNER, NODE
 from jaxslam.voronoi import Diagram, branches
@@ -49,10 +50,8 @@ def echoes(axis: Axes, poses: np.ndarray, points: np.ndarray, hit: np.ndarray) -
     """
     step, beam = np.nonzero(hit)
     thin = slice(None, None, 1 + len(step) // DOTS)
-    (x, y), pose = points[step[thin], beam[thin]].T, np.asarray(poses)[step[thin]]
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    there = pose[:, 0] + c * x - s * y, pose[:, 1] + s * x + c * y
-    axis.plot(*there, ",", color="#B5B5B5", zorder=0.5, label="_echoes", rasterized=True)
+    there = placed(np.asarray(poses)[step[thin]], points[step[thin], beam[thin]])
+    axis.plot(*there.T, ",", color="#B5B5B5", zorder=0.5, label="_echoes", rasterized=True)
 
 
 def trajectory(axis: Axes, poses: np.ndarray, what: str) -> None:
@@ -70,10 +69,8 @@ def trajectory(axis: Axes, poses: np.ndarray, what: str) -> None:
 
 def robot(axis: Axes, pose: np.ndarray, ends: np.ndarray) -> None:
     """Draw a robot at a pose (3,) and the ends (N, 2) of its beams [m, robot frame]."""
-    x, y, heading = np.asarray(pose, float)
-    c, s = np.cos(heading), np.sin(heading)
-    there = x + c * ends[:, 0] - s * ends[:, 1], y + s * ends[:, 0] + c * ends[:, 1]
-    axis.plot(*there, ".", color=ORANGE, markersize=2.5, zorder=2.5, label="scan")
+    x, y, heading = pose = np.asarray(pose, float)
+    axis.plot(*placed(pose, ends).T, ".", color=ORANGE, markersize=2.5, zorder=2.5, label="scan")
     marker = (3, 0, np.degrees(heading) - 90)
     axis.plot(x, y, marker=marker, color=BLUE, markersize=10, zorder=4, label="_robot")
 

@@ -10,6 +10,7 @@ error are theirs.
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import common, one_core
-from jaxslam import alignment, fit, lidar, logs, monte_carlo, report, slam
+from jaxslam import fit, lidar, logs, monte_carlo, online, report, slam
 from jaxslam.io import readers, relations, tum
 from jaxslam.io.errors import InputError
 from jaxslam.io.recording import Recording
@@ -59,7 +60,7 @@ class Seen(NamedTuple):
 
     config: Config
     log: Log  # with its motions aligned; the truth is the reference since the first scan
-    ms: dict[str, float]  # a scan, one core, of the front end, the alignment, and each filter
+    ms: dict[str, float]  # a scan, one core, from ranges to the topological map, by odometry
 
 
 def find(folder: Path | None) -> list[Known]:
@@ -97,25 +98,24 @@ def look(known: Known) -> Seen:
     """Features and aligned motions of a log, and what they and the filter cost on one core."""
     recording = known.recording
     config = logs.config_of_scans([recording])
-    motion = jnp.asarray(logs.motions(recording.odometry), float)
+    motion = logs.motions(recording.odometry)
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
-    align = lambda: alignment.odometry(config.alignment, config.lidar, scans, motion)
     truth, judged = np.zeros(motion.shape, np.float32), np.zeros(len(motion), bool)
     if known.reference is not None:
         i, j = match_times(recording.times, known.reference[0]).T
         truth[i] = seen_from(known.reference[1][j[0]], known.reference[1][j])
         judged[i] = True
-    nodes, _ = slam.local_maps(config, scans)
-    log = jax.tree.map(np.asarray, Log(truth, motion, nodes, None, judged, aligned=align()))
-    calls: dict[str, tuple] = {"front_end": (slam.local_maps, config, scans), "alignment": (align,)}
+    calls: dict[str, tuple] = {}
     for odometry in ODOMETRY:
-        inputs = monte_carlo.inputs_of(given(log, odometry, "all"))
-        start = slam.init(config, jnp.zeros(3))
-        calls[odometry] = slam.run, config, log_noise(aligned=odometry == "scan"), start, inputs
+        noise, how = log_noise(aligned=odometry == "scan"), {"aligned": odometry == "scan"}
+        whole = partial(online.survey, config, noise, jnp.zeros(3), motion, scans, **how)
+        calls[odometry] = (whole,)
     one_core.pin()
-    taken = one_core.least(calls, repeats=2)
+    taken = one_core.least(calls, repeats=1)
     one_core.unpin()
-    return Seen(config, log, {name: 1e3 * s / len(motion) for name, s in taken.items()})
+    found = calls["scan"][0]()
+    log = Log(truth, motion, found.nodes, None, judged, aligned=found.aligned)
+    return Seen(config, logs.real(log), {name: 1e3 * s / len(motion) for name, s in taken.items()})
 
 
 def given(log: Log, odometry: str, landmarks: str) -> Log:
@@ -148,10 +148,9 @@ def row(
     start = slam.init(seen.config, jnp.zeros(3))
     belief, info = slam.run(seen.config, noise, start, monte_carlo.inputs_of(log))
     poses = np.asarray(info.pose, np.float64)
-    ms = seen.ms["front_end"] + seen.ms[odometry]
     numbers: common.Numbers = dict.fromkeys(("ate_rmse_m", "relations_translation_m", "nees"))
     numbers["landmarks_confirmed"] = int(np.sum(slam.confirmed(seen.config, belief)))
-    numbers["ms_per_scan"] = ms + (seen.ms["alignment"] if odometry == "scan" else 0.0)
+    numbers["ms_per_scan"] = seen.ms[odometry]
     if known.reference is not None:
         told = report.against_reference(known.recording.times, poses, known.reference)
         error = np.where(log.judged[:, None], report.error_of(poses, log.truth), np.nan)

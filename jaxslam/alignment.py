@@ -279,13 +279,32 @@ def _joined(spec: AlignSpec, lidar: Lidar, local: LocalMap, scan: Scan, pose: Ar
 
 
 @partial(jax.jit, static_argnames=("spec", "lidar"))
-def odometry(spec: AlignSpec, lidar: Lidar, scans: Scan, wheels: Array) -> Aligned:
-    """Motions [T] by the scans of a log [T] whose wheels say `wheels` (T, 3), zero at the first."""
+def follow(
+    spec: AlignSpec,
+    lidar: Lidar,
+    local: LocalMap,
+    scans: Scan,
+    wheels: Array,
+    count: Array | None = None,
+) -> tuple[LocalMap, Aligned]:
+    """Align scans [T] one after the other, and the motions [T] that they tell.
 
-    def body(local: LocalMap, now: tuple[Scan, Array]) -> tuple[LocalMap, Aligned]:
-        return align(spec, lidar, local, *now)
+    Args:
+        spec: How.
+        lidar: The scanner.
+        local: Of the scans before.
+        scans: [T].
+        wheels: (T, 3) motions since the scan before, by the wheels; zero at the first of all.
+        count: () int32 scans that there are, the first ones; of the others nothing is kept.
+    """
+    known = jnp.arange(len(wheels), dtype=jnp.int32) < (len(wheels) if count is None else count)
 
-    return lax.scan(body, empty(spec, lidar), (scans, wheels))[1]
+    def body(local: LocalMap, now: tuple[Scan, Array, Array]) -> tuple[LocalMap, Aligned]:
+        *given, there = now
+        after, aligned = align(spec, lidar, local, *given)
+        return jax.tree.map(partial(jnp.where, there), after, local), aligned
+
+    return lax.scan(body, local, (scans, wheels, known))
 
 
 FLOOR = (0.01, 0.005)  # [m], [rad] of wheels beside scans, even where they stand still

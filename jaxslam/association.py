@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from scipy.special import chdtri
 
 from jaxslam.geometry import to_world
@@ -104,14 +105,11 @@ def claim_slots(worth: Array, wanted: Array) -> Array:
         wanted: (M,) bool.
     """
     l = worth.size
-    index = jnp.arange(l, dtype=jnp.int32)
-    before = (worth[:, None] < worth[None]) | (
-        (worth[:, None] == worth[None]) & (index[:, None] < index[None])
-    )
-    place = jnp.sum(before, axis=0, dtype=jnp.int32)  # in the order of worth
-    turn = jnp.where(wanted, jnp.cumsum(wanted, dtype=jnp.int32) - 1, l)
-    mine = (turn[:, None] == place[None]) & (worth < jnp.inf)[None]
-    return jnp.where(jnp.any(mine, axis=1), jnp.argmax(mine, axis=1), l).astype(jnp.int32)
+    less, order = lax.top_k(-worth, min(l, wanted.size))  # of equals the first
+    turn = jnp.cumsum(wanted, dtype=jnp.int32) - 1
+    at = jnp.clip(turn, 0, order.size - 1)
+    free = wanted & (turn < order.size) & (less[at] > -jnp.inf)
+    return jnp.where(free, order[at], l).astype(jnp.int32)
 
 
 def landmarks(

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from jaxslam.nodes import Nodes
@@ -83,6 +84,13 @@ def initial(pose: Array, *, landmarks: int, cov: Array | None = None) -> Belief:
         step=jnp.zeros((), jnp.int32),
         next_id=jnp.zeros((), jnp.int32),
     )
+
+
+def grown(belief: Belief, landmarks: int) -> Belief:
+    """The belief with more slots, L of them, free where there was none."""
+    blank = initial(belief.pose, landmarks=landmarks)
+    put = lambda old, new: new.at[tuple(slice(n) for n in old.shape)].set(old)
+    return jax.tree.map(put, belief, blank)
 
 
 def know(belief: Belief, places: Array, cov: Array, kind: int = NODE) -> Belief:

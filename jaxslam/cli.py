@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import tyro
 from tqdm import tqdm
 
 import jaxslam
-from jaxslam import film, lidar, logs, monte_carlo, plan, report, skeleton, slam
+from jaxslam import film, lidar, logs, monte_carlo, online, plan, report, skeleton, slam
 from jaxslam import world as worlds
 from jaxslam.batches import use_cores
 from jaxslam.io import graphml, occupancy, readers, tum
@@ -22,6 +22,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
+from jaxslam.online import Mapper, Part, Survey
 from jaxslam.options import keep_compiled, named, noise_of, stopwatch, within
 from jaxslam.poses import seen_from
 from jaxslam.slam import Config
@@ -165,9 +166,8 @@ def run(
             flush=True,
         )
         with stopwatch() as seconds:
-            moved = jnp.asarray(motions, float)
-            aligned = logs.align(config, scans, motions) if by_scans else None
-            survey = slam.survey(config, assumed, jnp.zeros(3), moved, scans, aligned)
+            given = config, assumed, jnp.zeros(3), motions, scans
+            survey = _map(*given, aligned=by_scans)
             poses = report.poses_of(survey)
         numbers = {
             "scans": len(poses),
@@ -188,7 +188,8 @@ def run(
             numbers |= report.against_relations(recording, poses, verified)
         numbers |= {"dead_reckoning": blind} if blind else {}
         report.write(place, numbers, recording.times, survey)
-        inputs = slam.Inputs(moved, survey.nodes, aligned=aligned)
+        told = jax.tree.map(jnp.asarray, (jnp.asarray(motions, float), survey.nodes))
+        inputs = slam.Inputs(*told, aligned=survey.aligned)
         report.write_maps(place, config, assumed, survey, inputs, scans)
         report.draw(place, config, survey, lines, error, scans=scans)
         if scan is not None:
@@ -196,6 +197,19 @@ def run(
         if animate:
             film.film(place / "run.gif", config, assumed, inputs, scans, poses, wheels)
     report.tell(numbers, f"{len(poses)} scans of {log}", out)
+
+
+def _map(*given: Any, aligned: bool) -> Survey:
+    """`online.survey` of a log, which shows how far it is."""
+    with tqdm(total=len(given[3]), unit="scan", desc="compiling", mininterval=0.2) as bar:
+
+        def watch(mapper: Mapper, part: Part) -> None:
+            bar.set_description("mapping", refresh=False)
+            found = int(np.sum(slam.confirmed(given[0], mapper.belief)))
+            bar.set_postfix_str(f"{found} landmarks", refresh=False)
+            bar.update(len(part.info.finite))
+
+        return online.survey(*given, aligned=aligned, watch=watch)
 
 
 def map_grid(

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.linalg import add_products, inverse_root
+from jaxslam.linalg import add_products, inverse_root, lower
 from jaxslam.types import Array
 
+LARGE = 256  # rows of a map from which it pays to leave zeros out
 GUARD = 2  # units of rounding by which an update raises the variances of the map
 
 
@@ -131,7 +132,7 @@ def _seen(cov: Blocks, rows: Rows) -> tuple[Array, Array, Array]:
 
 
 def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
-    slot = rows.slot
+    n, slot = 2 * rows.slot.size, rows.slot
     hp, hm, s = _seen(cov, rows)
     root, logdet, good = inverse_root(s)
     w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
@@ -139,8 +140,16 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     root, w = jnp.where(good, root, 0.0), jnp.where(good, w, 0.0)
     y_pose = add_products(jnp.zeros_like(hp), root.T, hp)
     y_map = add_products(jnp.zeros_like(hm), root.T, hm)
-    after = plus(cov, (y_pose, y_map), (y_pose, y_map), sign=-1)
-    after = after._replace(map=after.map * _guard(rows, good, after.map))
+    first, later = y_map, y_map[:0]
+    if len(cov.map) > LARGE:  # rows that count come first, and seldom are more than half of them
+        first, later = y_map[: n // 2], y_map[n // 2 :]
+    map = lower(cov.map, later, jnp.any(later != 0.0)) if len(later) else cov.map
+    map = add_products(map, first, first, sign=-1)
+    after = Blocks(
+        pose=add_products(cov.pose, y_pose, y_pose, sign=-1),
+        cross=add_products(cov.cross, y_pose, y_map, sign=-1),
+        map=map * _guard(rows, good, map),
+    )
     shift = jnp.concatenate([_mix(w, y_pose), _mix(w, y_map)])
     kept = (
         after.pose,

@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import alignment, lidar, slam
-from jaxslam.alignment import Aligned
+from jaxslam import lidar, online, slam
 from jaxslam.batches import Spread
 from jaxslam.io.recording import Recording, Sightings
 from jaxslam.lidar import Scan
@@ -80,18 +79,13 @@ def from_recording(
     wheels, truth, judged = wheels[begin:], truth[begin:], judged[begin:]
     motion = motions(wheels)
     scans = lidar.limit(jnp.asarray(recording.ranges[begin:], float), config.lidar)
-    by_scans = align(config, scans, motion) if aligned else None
-    return _real(Log(truth, motion, look(config, scans), None, judged, aligned=by_scans))
+    by_scans = online.align(config, scans, motion) if aligned else None
+    return real(Log(truth, motion, look(config, scans), None, judged, aligned=by_scans))
 
 
 def motions(poses: np.ndarray) -> np.ndarray:
     """Motion (T, 3) from each of poses (T, 3) to the next, zero at the first."""
     return np.concatenate([np.zeros((1, 3)), seen_from(poses[:-1], poses[1:])])
-
-
-def align(config: Config, scans: Scan, motion: np.ndarray) -> Aligned:
-    """Motions [T] by scans [T], beginning at those of the wheels (T, 3)."""
-    return alignment.odometry(config.alignment, config.lidar, scans, jnp.asarray(motion, float))
 
 
 def from_sightings(sightings: Sightings) -> Log:
@@ -103,7 +97,7 @@ def from_sightings(sightings: Sightings) -> Log:
     polar, valid = jnp.asarray(sightings.polar, float), jnp.asarray(sightings.valid)
     seen = jax.vmap(from_polar, in_axes=(0, 0, None))(polar, valid, PART)
     known = np.asarray(sightings.which, np.int32)
-    return _real(Log(sightings.truth, sightings.motion, seen, known, sightings.referenced))
+    return real(Log(sightings.truth, sightings.motion, seen, known, sightings.referenced))
 
 
 def config_of(sightings: Sequence[Sightings]) -> Config:
@@ -153,8 +147,8 @@ def stack(logs: Sequence[Log]) -> Log:
     return jax.tree.map(lambda *x: np.stack(x), *long)
 
 
-def _real(log: Log) -> Log:
-    """The log in NumPy arrays of JAX's precision."""
+def real(log: Log) -> Log:
+    """The log in NumPy arrays, of the precision that JAX works in."""
     precision = jnp.zeros(()).dtype
 
     def convert(x: np.ndarray) -> np.ndarray:

@@ -10,8 +10,9 @@ from jaxslam.io.occupancy import CELLS, Occupancy
 from jaxslam.io.posegraph import PoseGraph
 from jaxslam.lidar import Lidar, Scan, bearings
 from jaxslam.noise import Noise, sensor_noise
-from jaxslam.slam import Config, Inputs, Survey
-from jaxslam.types import WALL
+from jaxslam.online import Survey
+from jaxslam.slam import Config, Inputs
+from jaxslam.types import WALL, Array
 
 OCCUPIED = 0.25  # part of the beams at a cell that must end in it, for it to be occupied
 MARGIN = 0.5  # [m] of unknown cells around
@@ -71,6 +72,16 @@ def _cells(points: np.ndarray, low: np.ndarray, resolution: float) -> np.ndarray
     return np.floor((points - low) / resolution).astype(int)
 
 
+@partial(jax.jit, static_argnames="config")
+def _assumed(config: Config, noise: Noise, inputs: Inputs) -> tuple[Array, Array, Array]:
+    """Motions (T, 3), their covariances (T, 3, 3), and those of features (T, M, 2, 2)."""
+
+    def of(now: Inputs) -> tuple[Array, Array, Array]:
+        return *slam.moved(noise, now), sensor_noise(noise, now.nodes, doubt=config.doubt)
+
+    return jax.vmap(of)(inputs)
+
+
 def pose_graph(config: Config, noise: Noise, survey: Survey, inputs: Inputs) -> PoseGraph:
     """What a run of the filter was told, with its estimates: poses, nodes, corners.
 
@@ -87,11 +98,10 @@ def pose_graph(config: Config, noise: Noise, survey: Survey, inputs: Inputs) -> 
     names = np.asarray(belief.id)[np.asarray(kept)]
     seen_by, feature = np.nonzero(np.isin(np.asarray(info.id), names) & (np.asarray(info.id) >= 0))
     rank = {name: k for k, name in enumerate(names.tolist())}
-    motion, q = jax.vmap(slam.moved, in_axes=(None, 0))(noise, inputs)
+    motion, q, r = _assumed(config, noise, inputs)
     q = np.asarray(q, np.float64) + STANDSTILL**2 * np.eye(3)
-    polar = jax.vmap(partial(sensor_noise, doubt=config.doubt), in_axes=(None, 0))
     at = seen_by, feature
-    r = np.asarray(polar(noise, survey.nodes), np.float64)[at]
+    r = np.asarray(r, np.float64)[at]
     seen = np.asarray(survey.nodes.xy, np.float64)[at]
     turn = np.stack([-seen[:, 1], seen[:, 0]], axis=-1)  # what a radian of bearing moves
     ray = seen / np.linalg.norm(seen, axis=1, keepdims=True)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import lidar, motion, plan, slam
+from jaxslam import lidar, motion, online, plan, slam
 from jaxslam.alignment import Aligned
 from jaxslam.batches import Spread, map_batches
 from jaxslam.geometry import compose
@@ -20,7 +20,8 @@ from jaxslam.lidar import Scan
 from jaxslam.metrics import nees, pose_error
 from jaxslam.motion import Robot
 from jaxslam.nodes import Nodes
-from jaxslam.slam import Config, Inputs, Noise, Survey
+from jaxslam.online import Survey
+from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.types import Array, Key
 from jaxslam.world import World
 
@@ -135,7 +136,7 @@ def replay(
         return truth, told, lax.map(lambda now: _scan(config, world, *now), (truth, scan_keys))
 
     truth, told, scans = simulate_scans(own)
-    return truth, slam.survey(config, noise, truth[0], told, scans)
+    return truth, online.survey(config, noise, truth[0], told, scans)
 
 
 @partial(jax.jit, static_argnames=("config", "robot", "steps"))

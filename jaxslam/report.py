@@ -18,9 +18,10 @@ from jaxslam.io.recording import Recording
 from jaxslam.io.relations import Relations
 from jaxslam.lidar import Scan
 from jaxslam.monte_carlo import Track
+from jaxslam.online import Survey
 from jaxslam.poses import seen_from
 from jaxslam.skeleton import Survey as MapSurvey
-from jaxslam.slam import Config, Inputs, Noise, Survey
+from jaxslam.slam import Config, Inputs, Noise
 from jaxslam.topomap import Graph
 from jaxslam.types import NODE
 from jaxslam.world import World

@@ -1,6 +1,6 @@
-"""SLAM of one robot: scan to features, one step of the filter, a whole log.
+"""SLAM of one robot: scan to features, one step of the filter, a log of features.
 
-`step` is the only place where front end and filter meet, and `run` the only loop over time.
+`step` is the only place where front end and filter meet.
 """
 
 from functools import partial
@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
-from jaxslam import alignment, edges, ekf, junctions, links, nodes, topomap, voronoi
+from jaxslam import alignment, edges, ekf, junctions, links, nodes, voronoi
 from jaxslam.alignment import Aligned, AlignSpec
 from jaxslam.batches import map_batches
 from jaxslam.belief import Belief, forget, initial, note, worth
@@ -295,55 +294,7 @@ def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Be
     return lax.scan(body, start, inputs)
 
 
-class Survey(NamedTuple):
-    """A log, filtered, with its topological map."""
-
-    belief: Belief  # at the end
-    info: Info  # [T]
-    nodes: Nodes  # [T]
-    graph: topomap.Graph
-
-
 @partial(jax.jit, static_argnames="config")
 def local_maps(config: Config, scans: Scan) -> tuple[Nodes, Links]:
     """`local_map` of scans that lead with T, a few at a time, which bounds memory."""
     return map_batches(partial(local_map, config), scans, size=BATCH)
-
-
-@partial(jax.jit, static_argnames="config")
-def _arcs(config: Config, info: Info, joined: Links, scans: Scan) -> topomap.Arcs:
-    start = topomap.empty(arcs=2 * config.landmarks)
-    return topomap.build(start, info.id, info.pose, joined, scans, config.lidar)
-
-
-def survey(
-    config: Config,
-    noise: Noise,
-    start: Array,
-    motions: Array,
-    scans: Scan,
-    aligned: Aligned | None = None,
-) -> Survey:
-    """Run a whole log, and put its topological map together.
-
-    Args:
-        config: Of front end and filter.
-        noise: What the filter assumes.
-        start: (3,) first pose.
-        motions: (T, 3) odometry since the scan before, zero at the first.
-        scans: [T].
-        aligned: [T] the same motions by scans, to be fused with the odometry.
-    """
-    seen, joined = local_maps(config, scans)
-    inputs = Inputs(motions, seen, aligned=aligned)
-    belief, info = run(config, noise, init(config, start), inputs)
-    arcs = _arcs(config, info, joined, scans)
-    graph = topomap.graph(
-        belief,
-        arcs,
-        np.asarray(info.pose),
-        confirm=config.confirm,
-        apart=config.matching.apart,
-        alike=config.matching.shape,
-    )
-    return Survey(belief, info, seen, graph)

@@ -65,6 +65,11 @@ def empty(*, arcs: int) -> Arcs:
     )
 
 
+def grown(arcs: Arcs, size: int) -> Arcs:
+    """The arcs in more slots, A of them."""
+    return jax.tree.map(lambda old, new: new.at[: len(old)].set(old), arcs, empty(arcs=size))
+
+
 def attach(line: Array, first: Array, last: Array) -> Array:
     """Lay a line between two places: turned with its chord, what is left shared out along it.
 
@@ -195,27 +200,6 @@ def _forget(arcs: Arcs, gone: Array) -> Arcs:
     return arcs._replace(
         ends=jnp.where(gone[:, None], -1, arcs.ends), seen=jnp.where(gone, 0, arcs.seen)
     )
-
-
-def build(arcs: Arcs, ids: Array, poses: Array, links: Links, scans: Scan, lidar: Lidar) -> Arcs:
-    """Merge the links of many scans.
-
-    Args:
-        arcs: The arcs so far.
-        ids: (T, M) int32 landmark ids.
-        poses: (T, 3) estimated poses.
-        links: [T].
-        scans: [T].
-        lidar: The scanner.
-
-    Raises:
-        ValueError: An argument has another shape or type; while tracing.
-    """
-
-    def body(now: Arcs, step: tuple[Array, Array, Links, Scan]) -> tuple[Arcs, None]:
-        return add(now, *step, lidar), None
-
-    return lax.scan(body, arcs, (ids, poses, links, scans))[0]
 
 
 def _nodes(

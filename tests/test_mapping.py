@@ -6,7 +6,7 @@ import yaml
 from PIL import Image
 from scipy.optimize import least_squares
 
-from jaxslam import lidar, mapping, motion, slam, world
+from jaxslam import lidar, mapping, motion, online, slam, world
 from jaxslam.io import occupancy, posegraph
 from jaxslam.io.errors import InputError
 from jaxslam.lidar import Lidar
@@ -87,7 +87,7 @@ def drive():
     scans = jax.vmap(lidar.disturb, in_axes=(0, 0, None))(
         jax.random.split(jax.random.key(0), 12), scans_of(true), LIDAR
     )
-    survey = slam.survey(config, noise, jnp.asarray(true[0]), moves, scans)
+    survey = online.survey(config, noise, jnp.asarray(true[0]), moves, scans)
     return survey, noise, slam.Inputs(moves, survey.nodes), config, true
 
 

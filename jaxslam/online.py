@@ -1,0 +1,242 @@
+"""A drive mapped as its scans come in: odometry from scans, filter, topological map.
+
+Scans are taken `STRETCH` at a time by programs that know neither the length of the drive nor, up
+to a step, the number of its landmarks: what is compiled for one log serves all by that scanner.
+Where the robot is, and the map, are there after each stretch.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxslam import alignment, slam, topomap
+from jaxslam.alignment import Aligned, LocalMap
+from jaxslam.batches import pad
+from jaxslam.belief import Belief, grown
+from jaxslam.lidar import Scan
+from jaxslam.links import Links
+from jaxslam.nodes import Nodes
+from jaxslam.noise import Noise
+from jaxslam.slam import Config, Info, Inputs
+from jaxslam.topomap import Arcs, Graph
+from jaxslam.types import Array
+
+STRETCH = 64  # scans
+ROOM = 384  # slots by which the map of the filter grows
+SPARE = 128  # free ones at the beginning of a stretch, at least
+
+
+class Mapper(NamedTuple):
+    """All that is known after some scans, and all that the next ones need."""
+
+    belief: Belief
+    arcs: Arcs
+    local: LocalMap | None  # of aligned scans; None where odometry is that of the wheels
+
+
+class Part(NamedTuple):
+    """What some scans in a row gave; NumPy arrays that lead with their number."""
+
+    info: Info
+    nodes: Nodes
+    aligned: Aligned | None  # motions by scans, where they are aligned
+
+
+class Survey(NamedTuple):
+    """A drive, filtered, with its topological map."""
+
+    belief: Belief  # at the end
+    info: Info  # [T]
+    nodes: Nodes  # [T]
+    graph: Graph
+    aligned: Aligned | None = None  # [T] motions by scans, where they were aligned
+
+
+class _Seen(NamedTuple):
+    """A stretch of scans, looked at, filled up with its last scan."""
+
+    count: Array  # () int32 scans that there are
+    scans: Scan  # [STRETCH]
+    inputs: Inputs  # [STRETCH]
+    links: Links  # [STRETCH]
+    local: LocalMap | None  # after them
+
+
+@partial(jax.jit, static_argnames=("config", "aligned"))
+def begin(config: Config, start: Array, *, aligned: bool) -> Mapper:
+    """A robot at a pose (3,) with an empty map.
+
+    Args:
+        config: Of the filter; `landmarks` is how many the map may come to hold.
+        start: First pose, world frame.
+        aligned: Whether scans are to be aligned and fused with the wheels.
+    """
+    room = min(ROOM, config.landmarks)
+    return Mapper(
+        slam.init(config._replace(landmarks=room), start),
+        topomap.empty(arcs=2 * room),
+        alignment.empty(config.alignment, config.lidar) if aligned else None,
+    )
+
+
+def extend(
+    config: Config, noise: Noise, mapper: Mapper, motions: Array, scans: Scan
+) -> tuple[Mapper, Part]:
+    """Map the next scans.
+
+    Args:
+        config: As it began.
+        noise: What the filter assumes.
+        mapper: After the scans before.
+        motions: (N, 3) odometry since the scan before, N at most `STRETCH`.
+        scans: [N].
+
+    Raises:
+        ValueError: There is no scan, or there are too many.
+    """
+    return _learn(config, noise, mapper, _look(config, mapper.local, motions, scans))
+
+
+def survey(
+    config: Config,
+    noise: Noise,
+    start: Array,
+    motions: Array,
+    scans: Scan,
+    *,
+    aligned: bool = False,
+    watch: Callable[[Mapper, Part], Any] | None = None,
+) -> Survey:
+    """Map a whole drive.
+
+    Args:
+        config: Of front end and filter; `landmarks` is how many the map may come to hold.
+        noise: What the filter assumes.
+        start: (3,) first pose.
+        motions: (T, 3) odometry since the scan before, zero at the first.
+        scans: [T].
+        aligned: Whether scans are to be aligned and fused with the wheels.
+        watch: Called after each stretch with what is known by then, and what the stretch gave.
+    """
+    # Slices of JAX's own arrays would each be compiled.
+    motions, scans = np.asarray(motions), jax.tree.map(np.asarray, scans)
+    mapper, parts = begin(config, start, aligned=aligned), []
+
+    def look(first: int, local: LocalMap | None) -> _Seen:
+        some = slice(first, first + STRETCH)
+        return _look(config, local, motions[some], jax.tree.map(lambda x: x[some], scans))
+
+    # The next stretch is looked at while the filter works on the last.
+    seen = look(0, mapper.local)
+    for first in range(0, len(motions), STRETCH):
+        now, after = seen, first + STRETCH
+        seen = look(after, now.local) if after < len(motions) else None
+        mapper, part = _learn(config, noise, mapper, now)
+        parts.append(part)
+        if watch is not None:
+            watch(mapper, part)
+    whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return Survey(
+        mapper.belief,
+        whole.info,
+        whole.nodes,
+        graph(config, mapper, whole.info.pose),
+        whole.aligned,
+    )
+
+
+def graph(config: Config, mapper: Mapper, poses: np.ndarray) -> Graph:
+    """The topological map as it stands, of a robot that was at poses (T, 3)."""
+    return topomap.graph(
+        mapper.belief,
+        mapper.arcs,
+        np.asarray(poses),
+        confirm=config.confirm,
+        apart=config.matching.apart,
+        alike=config.matching.shape,
+    )
+
+
+def align(config: Config, scans: Scan, motions: Array) -> Aligned:
+    """Motions [T] by scans [T] alone, NumPy, beginning at those of the wheels (T, 3)."""
+    motions, scans = np.asarray(motions), jax.tree.map(np.asarray, scans)
+    local, parts = alignment.empty(config.alignment, config.lidar), []
+    for first in range(0, len(motions), STRETCH):
+        some = jax.tree.map(lambda x: x[first : first + STRETCH], (scans, motions))  # noqa: B023
+        given = (*jax.tree.map(_real, pad(some, to=STRETCH)), jnp.int32(len(some[1])))
+        local, part = alignment.follow(config.alignment, config.lidar, local, *given)
+        parts.append(part)
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(motions)], *parts)
+
+
+def _real(x: np.ndarray) -> Array:
+    """An array of JAX's, in its precision."""
+    return jnp.asarray(x, float if x.dtype.kind == "f" else None)
+
+
+def _look(config: Config, local: LocalMap | None, motions: np.ndarray, scans: Scan) -> _Seen:
+    """Features, links and, with a local map of scans, aligned motions of a stretch."""
+    if not 1 <= len(motions) <= STRETCH:
+        raise ValueError(f"{len(motions)} scans; a stretch has 1 to {STRETCH}")
+    count, aligned = jnp.int32(len(motions)), None
+    motions, scans = jax.tree.map(_real, pad((motions, scans), to=STRETCH))
+    with ThreadPoolExecutor(1) as other:  # neither waits for the other, to be compiled or to run
+        features = other.submit(slam.local_maps, config, scans)
+        if local is not None:
+            how = config.alignment, config.lidar
+            local, aligned = alignment.follow(*how, local, scans, motions, count)
+        nodes, links = features.result()
+    return _Seen(count, scans, Inputs(motions, nodes, aligned=aligned), links, local)
+
+
+def _learn(config: Config, noise: Noise, mapper: Mapper, seen: _Seen) -> tuple[Mapper, Part]:
+    """Filter a stretch, and add its links to the map."""
+    belief, arcs = _grown(config, mapper.belief, mapper.arcs)
+    room = config._replace(landmarks=belief.seen.size)
+    (belief, arcs), info = _steps(room, noise, (belief, arcs), seen._replace(local=None))
+    part = Part(info, seen.inputs.nodes, seen.inputs.aligned)
+    part = jax.tree.map(lambda x: np.asarray(x)[: seen.count], part)
+    return Mapper(belief, arcs, seen.local), part
+
+
+def _grown(config: Config, belief: Belief, arcs: Arcs) -> tuple[Belief, Arcs]:
+    """Room for the landmarks of a stretch, and for two arcs of each that there is room for."""
+    size = belief.seen.size
+    to = min(size + ROOM, config.landmarks)
+    if size == to or np.count_nonzero(belief.seen) <= size - SPARE:
+        return belief, arcs
+    return grown(belief, to), topomap.grown(arcs, 2 * to)
+
+
+@partial(jax.jit, static_argnames="config")
+def _step(
+    config: Config, noise: Noise, now: tuple[Belief, Arcs], inputs: Inputs, links: Links, scan: Scan
+) -> tuple[tuple[Belief, Arcs], Info]:
+    """Filter one scan, and add its links."""
+    belief, info = slam.step(config, noise, now[0], inputs)
+    arcs = topomap.add(now[1], info.id, info.pose, links, scan, config.lidar)
+    return (belief, arcs), info
+
+
+@partial(jax.jit, static_argnames="config")
+def _steps(
+    config: Config, noise: Noise, now: tuple[Belief, Arcs], seen: _Seen
+) -> tuple[tuple[Belief, Arcs], Info]:
+    """Filter the scans that there are; the info of the rest of the stretch is blank."""
+    given = seen.inputs, seen.links, seen.scans
+    at = lambda k: jax.tree.map(lambda x: x[k], given)
+
+    def body(k: Array, all: tuple[tuple[Belief, Arcs], Info]) -> tuple[tuple[Belief, Arcs], Info]:
+        now, info = _step(config, noise, all[0], *at(k))
+        return now, jax.tree.map(lambda old, new: old.at[k].set(new), all[1], info)
+
+    # Jitted, and closing over nothing, a step is traced once for its shapes and for the loop.
+    shapes = jax.eval_shape(_step, config, noise, now, *at(0))[1]
+    blank = jax.tree.map(lambda x: jnp.zeros((STRETCH, *x.shape), x.dtype), shapes)
+    return lax.fori_loop(0, seen.count, body, (now, blank))

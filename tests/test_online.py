@@ -1,0 +1,130 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import alignment, lidar, online, slam, topomap, world
+from jaxslam.alignment import AlignSpec
+from jaxslam.lidar import Lidar
+from jaxslam.poses import seen_from
+from jaxslam.slam import Config, Inputs
+
+T = 11
+LIDAR = Lidar(beams=91, first=-np.pi / 2, step=np.pi / 90)
+CONFIG = Config(lidar=LIDAR, landmarks=60, fresh=4, alignment=AlignSpec(scans=4, turns=(0.0,)))
+NOISE = slam.log_noise(aligned=True)
+START = jnp.array([2.5, 2.0, 0.3])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short():
+    """Stretches of four scans, and a map that grows by 18 slots."""
+    patch = pytest.MonkeyPatch()
+    for name, value in {"STRETCH": 4, "ROOM": 18, "SPARE": 16}.items():
+        patch.setattr(online, name, value)
+    yield
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Motions (T, 3) by wheels, and scans [T], of a way around the room."""
+    turn = np.linspace(0.0, 2.0, T)
+    poses = np.stack([2.5 + np.cos(turn), 2.0 + np.sin(turn), turn + np.pi / 2], axis=1)
+    room, keys = world.named("fig07"), jax.random.split(jax.random.key(0), T)
+    look = lambda key, pose: lidar.disturb(key, lidar.cast(room, pose, LIDAR), LIDAR)
+    told = seen_from(poses[:-1], poses[1:]) + np.random.default_rng(0).normal(0, 0.01, (T - 1, 3))
+    return np.concatenate([np.zeros((1, 3)), told]), jax.vmap(look)(keys, jnp.asarray(poses))
+
+
+def close(one, two):
+    assert jax.tree.structure(one) == jax.tree.structure(two)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), one, two)
+
+
+@pytest.fixture(scope="module")
+def surveys(drive):
+    """By wheels and by scans: what was mapped, and what was known after each stretch."""
+
+    def of(aligned):
+        heard = []
+        watch = lambda *now: heard.append(now)
+        how = {"aligned": aligned, "watch": watch}
+        return online.survey(CONFIG, NOISE, START, *drive, **how), heard
+
+    return {aligned: of(aligned) for aligned in (False, True)}
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+def test_stretches_that_grow_give_what_one_log_with_all_room_gives(drive, surveys, aligned):
+    motions, scans = drive
+    seen, links = slam.local_maps(CONFIG, scans)
+    told = None
+    if aligned:
+        local = alignment.empty(CONFIG.alignment, LIDAR)
+        _, told = alignment.follow(CONFIG.alignment, LIDAR, local, scans, jnp.asarray(motions))
+    inputs = Inputs(jnp.asarray(motions), seen, aligned=told)
+    belief, info = slam.run(CONFIG, NOISE, slam.init(CONFIG, START), inputs)
+    arcs = topomap.empty(arcs=2 * CONFIG.landmarks)
+    for t in range(T):
+        link, scan = jax.tree.map(lambda x: x[t], (links, scans))  # noqa: B023
+        arcs = topomap.add(arcs, info.id[t], info.pose[t], link, scan, LIDAR)
+    found, heard = surveys[aligned]
+    size = found.belief.seen.size
+    assert 18 < size < CONFIG.landmarks and np.sum(belief.seen > 0) > 6
+    # A slot that is none is the number of slots.
+    slot = np.where(found.info.slot == found.belief.seen.size, CONFIG.landmarks, found.info.slot)
+    slot = np.where(np.asarray(info.slot) == CONFIG.landmarks, CONFIG.landmarks, slot)
+    close(found.info._replace(slot=slot), info)
+    close(found.nodes, seen)
+    close(found.aligned, told)
+    for few, all in zip(found.belief, belief, strict=True):
+        np.testing.assert_allclose(few, np.asarray(all)[tuple(map(slice, few.shape))], atol=1e-9)
+    mapper = heard[-1][0]
+    close(mapper.arcs, jax.tree.map(lambda x: x[: 2 * size], arcs))
+    assert not arcs.seen[2 * size :].any() and len(found.graph.id) > 4
+
+
+def test_a_stretch_is_told_when_it_is_done(surveys):
+    found, heard = surveys[True]
+    assert [len(part.info.finite) for _, part in heard] == [4, 4, 3]
+    np.testing.assert_array_equal(heard[0][0].belief.pose, found.info.pose[3])
+    np.testing.assert_array_equal(heard[1][1].info.id, found.info.id[4:8])
+    close(heard[-1][0].belief, found.belief)
+
+
+def test_scans_may_come_in_any_portions(drive, surveys):
+    mapper, first = online.begin(CONFIG, START, aligned=True), 0
+    for count in (1, 3, 2, 4, 1):
+        some = jax.tree.map(lambda x: x[first : first + count], drive)  # noqa: B023
+        mapper, part = online.extend(CONFIG, NOISE, mapper, *map(_numpy, some))
+        assert len(part.info.pose) == count
+        first += count
+    found = surveys[True][0]
+    # Room was made at other times: what counts lies in the same slots.
+    count = min(mapper.belief.seen.size, found.belief.seen.size)
+    np.testing.assert_allclose(mapper.belief.pose, found.belief.pose, atol=1e-9)
+    np.testing.assert_array_equal(mapper.belief.seen[:count], found.belief.seen[:count])
+
+
+def _numpy(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+def test_motions_by_scans_alone_are_those_of_the_whole_survey(drive, surveys):
+    motions, scans = drive
+    close(online.align(CONFIG, scans, motions), surveys[True][0].aligned)
+
+
+def test_a_log_of_another_length_needs_no_other_program(drive, surveys):
+    motions, scans = _numpy(drive)
+    size = slam.local_maps._cache_size(), online._steps._cache_size()
+    online.survey(CONFIG, NOISE, START, motions[:6], jax.tree.map(lambda x: x[:6], scans))
+    assert (slam.local_maps._cache_size(), online._steps._cache_size()) == size
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_a_stretch_has_its_number_of_scans(drive, count):
+    some = jax.tree.map(lambda x: x[:count], _numpy(drive))
+    with pytest.raises(ValueError, match=f"{count} scans; a stretch has 1 to 4"):
+        online.extend(CONFIG, NOISE, online.begin(CONFIG, START, aligned=False), *some)

@@ -93,7 +93,10 @@ class _Ids(NamedTuple):
 
 def _some(mask: Array) -> Array:
     """Cells (MEETS,) int32 in which a mask (H, W) is True, H W for none."""
-    return jnp.nonzero(mask.reshape(-1), size=MEETS, fill_value=mask.size)[0].astype(jnp.int32)
+    # The first of them by the number of the cell; an exact float32, and half the time of `nonzero`.
+    first = -jnp.arange(mask.size, dtype=jnp.float32)
+    score, cell = lax.top_k(jnp.where(mask.reshape(-1), first, -jnp.inf), min(MEETS, mask.size))
+    return jnp.where(score > -jnp.inf, cell, mask.size).astype(jnp.int32)
 
 
 def _largest(cells: Array) -> Array:
@@ -111,11 +114,13 @@ def _top(score: Array, cells: Array, count: int, reach: int, width: int) -> tupl
     """
 
     def step(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-        at = jnp.argmax(left)
+        # The first of the largest: two plain reductions are many times as fast as `argmax`.
+        at = jnp.min(jnp.where(left == jnp.max(left), index, index.size - 1))
         square = (rows - rows[at]) ** 2 + (columns - columns[at]) ** 2
         return jnp.where(square < reach**2, -jnp.inf, left), (cells[at], left[at] > -jnp.inf)
 
     rows, columns = cells // width, cells % width
+    index = jnp.arange(cells.size, dtype=jnp.int32)
     return lax.scan(step, score, length=count)[1]
 
 
@@ -293,8 +298,8 @@ def _measure(
         way = way.at[1:-1].set(jnp.where(fixed[1:-1, None], way[1:-1], mean))
     fine = resample(way, FINE * (LINE - 1) + 1)
     length = jnp.sum(jnp.linalg.norm(jnp.diff(fine, axis=0), axis=1))
-    room = jnp.min(jnp.linalg.norm(fine[:, None] - hits[None], axis=2))
-    return fine[::FINE], length, room
+    x, y = (fine[:, None, k] - hits[None, :, k] for k in range(2))
+    return fine[::FINE], length, jnp.sqrt(jnp.min(x * x + y * y))
 
 
 def resample(way: Array, count: int) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxslam.linalg import add_products, inverse_root, lower
 from jaxslam.types import Array
 
-LARGE = 256  # rows of a map from which it pays to leave zeros out
+LARGE = 256  # rows of a map above which it pays to leave zeros out
 GUARD = 2  # units of rounding by which an update raises the variances of the map
 
 
@@ -148,7 +148,7 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     after = Blocks(
         pose=add_products(cov.pose, y_pose, y_pose, sign=-1),
         cross=add_products(cov.cross, y_pose, y_map, sign=-1),
-        map=map * _guard(rows, good, map),
+        map=_guarded(map, good & jnp.any(rows.by_slot != 0.0)),
     )
     shift = jnp.concatenate([_mix(w, y_pose), _mix(w, y_map)])
     kept = (
@@ -161,15 +161,18 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     return result, _Kept(root, y_pose, y_map, w, kept, rows)
 
 
-def _guard(rows: Rows, good: Array, map: Array) -> Array:
-    """Factors (2 L, 2 L): a little over 1 on the diagonal, if anything was observed.
+def _guarded(map: Array, seen: Array) -> Array:
+    """The map (2 L, 2 L) with a little over its diagonal, if anything was `seen` () bool.
 
     In single precision P - Y^T Y alone is indefinite after some ten thousand steps where the map
     learns nothing more: each loses half a unit of rounding.
     """
-    seen = good & jnp.any(rows.by_slot != 0.0)
-    raised = 1 + GUARD * np.finfo(map.dtype).eps * np.eye(len(map))  # a constant: half the cost
-    return jnp.where(seen, raised.astype(map.dtype), jnp.ones((), map.dtype))
+    more, one = GUARD * np.finfo(map.dtype).eps, jnp.ones((), map.dtype)
+    if len(map) > LARGE:
+        at = jnp.arange(len(map), dtype=jnp.int32)
+        return map.at[at, at].multiply(jnp.where(seen, one + more, one), unique_indices=True)
+    raised = 1 + more * np.eye(len(map))  # a constant: half the cost, as long as it is small
+    return map * jnp.where(seen, raised.astype(map.dtype), one)
 
 
 def _mix(weight: Array, rows: Array) -> Array:

@@ -97,7 +97,7 @@ def find(folder: Path | None) -> list[Known]:
 def look(known: Known) -> Seen:
     """Features and aligned motions of a log, and what they and the filter cost on one core."""
     recording = known.recording
-    config = logs.config_of_scans([recording])
+    config = logs.config_of_scans([recording])._replace(landmarks=online.MOST)
     motion = logs.motions(recording.odometry)
     scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
     truth, judged = np.zeros(motion.shape, np.float32), np.zeros(len(motion), bool)
@@ -114,6 +114,7 @@ def look(known: Known) -> Seen:
     taken = one_core.least(calls, repeats=1)
     one_core.unpin()
     found = calls["scan"][0]()
+    config = config._replace(landmarks=found.belief.seen.size)  # as many as it grew to
     log = Log(truth, motion, found.nodes, None, judged, aligned=found.aligned)
     return Seen(config, logs.real(log), {name: 1e3 * s / len(motion) for name, s in taken.items()})
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam.covariance import Postponed, settle
 from jaxslam.nodes import Nodes
 from jaxslam.types import NODE, Array, expect, expect_covariance
 
@@ -19,7 +20,7 @@ class Belief(NamedTuple):
     anchor: Array  # (D,) pose as last predicted, slots as first estimated
     pose_cov: Array  # (3, 3)
     cross_cov: Array  # (3, 2 L) of pose and slots
-    map_cov: Array  # (2 L, 2 L)
+    map_cov: Array | Postponed  # (2 L, 2 L)
     seen: Array  # (L,) int32 how often the landmark was seen; 0 marks a free slot
     last: Array  # (L,) int32 step it was last seen
     missed: Array  # (L,) int32 steps in a row that it should have been seen and was not
@@ -40,7 +41,7 @@ class Belief(NamedTuple):
     def cov(self) -> Array:
         """Covariance (D, D) of pose and slots, put together."""
         top = jnp.concatenate([self.pose_cov, self.cross_cov], axis=-1)
-        low = jnp.concatenate([jnp.swapaxes(self.cross_cov, -1, -2), self.map_cov], axis=-1)
+        low = jnp.concatenate([jnp.swapaxes(self.cross_cov, -1, -2), settle(self.map_cov)], axis=-1)
         return jnp.concatenate([top, low], axis=-2)
 
     @property

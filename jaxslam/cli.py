@@ -151,7 +151,7 @@ def run(
     assumed = noise_of(noise, slam.log_noise(aligned=by_scans))
     if scan is not None:
         within("--scan", scan, 0, len(recording.times) - 1)
-    config = logs.config_of_scans([recording])
+    config = logs.config_of_scans([recording])._replace(landmarks=online.MOST)
     wheels = seen_from(recording.odometry[0], recording.odometry)
     with named(f"{reference or ''}"):
         blind = {} if known is None else report.against_reference(recording.times, wheels, known)
@@ -190,6 +190,7 @@ def run(
         report.write(place, numbers, recording.times, survey)
         told = jax.tree.map(jnp.asarray, (jnp.asarray(motions, float), survey.nodes))
         inputs = slam.Inputs(*told, aligned=survey.aligned)
+        config = config._replace(landmarks=survey.belief.seen.size)
         report.write_maps(place, config, assumed, survey, inputs, scans)
         report.draw(place, config, survey, lines, error, scans=scans)
         if scan is not None:

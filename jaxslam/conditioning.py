@@ -8,13 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxslam.linalg import add_products, inverse_root, lower
+from jaxslam.covariance import Postponed, rows_at, subtract
+from jaxslam.linalg import add_products, inverse_root
 from jaxslam.types import Array
-
-LARGE = 256  # rows of a map above which it pays to leave zeros out
-GUARD = 2  # units of rounding by which an update raises the variances of the map
 
 
 class Blocks(NamedTuple):
@@ -22,7 +19,7 @@ class Blocks(NamedTuple):
 
     pose: Array  # (3, 3)
     cross: Array  # (3, 2 L)
-    map: Array  # (2 L, 2 L)
+    map: Array | Postponed  # (2 L, 2 L)
 
 
 class Rows(NamedTuple):
@@ -73,9 +70,9 @@ def condition(cov: Blocks, rows: Rows) -> Conditioned:
         S = H P H^T + R,   A S A^T = I,   Y = A H P,   P' = P - Y^T Y,   shift = Y^T A v
 
     P stays symmetric by construction, and positive definite for any number of steps: its diagonal
-    is raised by `GUARD` units of rounding, which no derivative knows of. No inverse is taken. Where
-    S is not positive definite, by rounding or nonsense, or a residual is not finite, nothing is
-    changed.
+    is raised by `covariance.GUARD` units of rounding, which no derivative knows of. No inverse is
+    taken. Where S is not positive definite, by rounding or nonsense, or a residual is not finite,
+    nothing is changed.
 
     Derivatives are taken in reverse only, by hand: `_pull`. They take `cov` for symmetric.
 
@@ -120,7 +117,7 @@ def _seen(cov: Blocks, rows: Rows) -> tuple[Array, Array, Array]:
     """H P, of the pose (N, 3) and of the map (N, 2 L), and S (N, N)."""
     n, slot = 2 * rows.slot.size, rows.slot
     across = jnp.moveaxis(_of_slots(cov.cross, slot), 0, 2)  # (M, 2, 3)
-    own = cov.map.reshape(-1, 2, cov.map.shape[1])[slot]  # (M, 2, 2 L)
+    own = rows_at(cov.map, slot)  # (M, 2, 2 L)
     hp = (_times(rows.by_pose, cov.pose[None]) + _times(rows.by_slot, across)).reshape(n, 3)
     hm = (_times(rows.by_pose, cov.cross[None]) + _times(rows.by_slot, own)).reshape(n, -1)
     seen = _of_slots(hm, slot)  # (N, M, 2)
@@ -132,7 +129,7 @@ def _seen(cov: Blocks, rows: Rows) -> tuple[Array, Array, Array]:
 
 
 def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
-    n, slot = 2 * rows.slot.size, rows.slot
+    slot = rows.slot
     hp, hm, s = _seen(cov, rows)
     root, logdet, good = inverse_root(s)
     w = jnp.sum(root * rows.residual.reshape(-1)[None], axis=1)
@@ -140,39 +137,20 @@ def _push(cov: Blocks, rows: Rows) -> tuple[Conditioned, _Kept]:
     root, w = jnp.where(good, root, 0.0), jnp.where(good, w, 0.0)
     y_pose = add_products(jnp.zeros_like(hp), root.T, hp)
     y_map = add_products(jnp.zeros_like(hm), root.T, hm)
-    first, later = y_map, y_map[:0]
-    if len(cov.map) > LARGE:  # rows that count come first, and seldom are more than half of them
-        first, later = y_map[: n // 2], y_map[n // 2 :]
-    map = lower(cov.map, later, jnp.any(later != 0.0)) if len(later) else cov.map
-    map = add_products(map, first, first, sign=-1)
     after = Blocks(
         pose=add_products(cov.pose, y_pose, y_pose, sign=-1),
         cross=add_products(cov.cross, y_pose, y_map, sign=-1),
-        map=_guarded(map, good & jnp.any(rows.by_slot != 0.0)),
+        map=subtract(cov.map, y_map, good & jnp.any(rows.by_slot != 0.0)),
     )
     shift = jnp.concatenate([_mix(w, y_pose), _mix(w, y_map)])
     kept = (
         after.pose,
         after.cross,
         jnp.moveaxis(_of_slots(after.cross, slot), 0, 2),
-        after.map.reshape(hm.shape[1] // 2, 2, -1)[slot],
+        rows_at(after.map, slot),
     )
     result = Conditioned(shift, after, jnp.sum(w * w), logdet, good)
     return result, _Kept(root, y_pose, y_map, w, kept, rows)
-
-
-def _guarded(map: Array, seen: Array) -> Array:
-    """The map (2 L, 2 L) with a little over its diagonal, if anything was `seen` () bool.
-
-    In single precision P - Y^T Y alone is indefinite after some ten thousand steps where the map
-    learns nothing more: each loses half a unit of rounding.
-    """
-    more, one = GUARD * np.finfo(map.dtype).eps, jnp.ones((), map.dtype)
-    if len(map) > LARGE:
-        at = jnp.arange(len(map), dtype=jnp.int32)
-        return map.at[at, at].multiply(jnp.where(seen, one + more, one), unique_indices=True)
-    raised = 1 + more * np.eye(len(map))  # a constant: half the cost, as long as it is small
-    return map * jnp.where(seen, raised.astype(map.dtype), one)
 
 
 def _mix(weight: Array, rows: Array) -> Array:

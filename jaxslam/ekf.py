@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jaxslam.association import claim_slots
 from jaxslam.belief import Belief, forget
 from jaxslam.conditioning import Blocks, Conditioned, Rows, condition, plus
+from jaxslam.covariance import put_rows, rows_at, subtract_seldom
 from jaxslam.geometry import compose, rotation, to_world, wrap_angle, wrap_line
-from jaxslam.linalg import add_products, inverse_root, lower, put_rows
+from jaxslam.linalg import add_products, inverse_root
 from jaxslam.nodes import Nodes
 from jaxslam.sensor import expect, observation, residual
 from jaxslam.types import WALL, Array
@@ -158,7 +159,7 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     pair = jnp.stack([keep, jnp.where(found, drop, keep)])
     difference = lambda x: x[..., 0, :] - x[..., 1, :]
     hp = difference(belief.cross_cov.reshape(3, size, 2)[:, pair]).T  # (2, 3)
-    hm = belief.map_cov.reshape(size, 2, -1)[pair]
+    hm = rows_at(belief.map_cov, pair)
     hm = hm[0] - hm[1]  # (2, 2 L)
     s = difference(hm.reshape(2, size, 2)[:, pair]) + std**2 * jnp.eye(2, dtype=hm.dtype)
     root, _, good = inverse_root(s)
@@ -168,7 +169,7 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     cov = Blocks(
         pose=add_products(belief.pose_cov, y[0], y[0], sign=-1),
         cross=add_products(belief.cross_cov, y[0], y[1], sign=-1),
-        map=lower(belief.map_cov, y[1], found),
+        map=subtract_seldom(belief.map_cov, y[1], found),
     )
     belief = _with(belief, belief.mean + jnp.concatenate([w @ y[0], w @ y[1]]), cov)
     gone = found & good & (jnp.arange(size, dtype=jnp.int32) == drop)

@@ -19,6 +19,7 @@ from jaxslam import alignment, slam, topomap
 from jaxslam.alignment import Aligned, LocalMap
 from jaxslam.batches import pad
 from jaxslam.belief import Belief, grown
+from jaxslam.covariance import make_room, postpone, settle
 from jaxslam.lidar import Scan
 from jaxslam.links import Links
 from jaxslam.nodes import Nodes
@@ -30,6 +31,7 @@ from jaxslam.types import Array
 STRETCH = 64  # scans
 ROOM = 384  # slots by which the map of the filter grows
 SPARE = 128  # free ones at the beginning of a stretch, at least
+MOST = 2048  # slots, unless told otherwise: what a building of some kilometres of corridor has
 
 
 class Mapper(NamedTuple):
@@ -219,7 +221,8 @@ def _step(
     config: Config, noise: Noise, now: tuple[Belief, Arcs], inputs: Inputs, links: Links, scan: Scan
 ) -> tuple[tuple[Belief, Arcs], Info]:
     """Filter one scan, and add its links."""
-    belief, info = slam.step(config, noise, now[0], inputs)
+    cov = make_room(now[0].map_cov, 2 * config.matches + 2)  # and the two of a merge
+    belief, info = slam.step(config, noise, now[0]._replace(map_cov=cov), inputs)
     arcs = topomap.add(now[1], info.id, info.pose, links, scan, config.lidar)
     return (belief, arcs), info
 
@@ -239,4 +242,7 @@ def _steps(
     # Jitted, and closing over nothing, a step is traced once for its shapes and for the loop.
     shapes = jax.eval_shape(_step, config, noise, now, *at(0))[1]
     blank = jax.tree.map(lambda x: jnp.zeros((STRETCH, *x.shape), x.dtype), shapes)
-    return lax.fori_loop(0, seen.count, body, (now, blank))
+    if config.linearisation != "invariant":  # which swings the whole map at each update
+        now = now[0]._replace(map_cov=postpone(now[0].map_cov)), now[1]
+    (belief, arcs), info = lax.fori_loop(0, seen.count, body, (now, blank))
+    return (belief._replace(map_cov=settle(belief.map_cov)), arcs), info

@@ -13,6 +13,7 @@ from jax import lax
 from jaxslam.association import compatible, match
 from jaxslam.belief import Belief
 from jaxslam.conditioning import Rows
+from jaxslam.covariance import blocks_of, rows_at
 from jaxslam.geometry import to_world, wrap_angle, wrap_line
 from jaxslam.nodes import Nodes
 from jaxslam.sensor import differences, expect, observation
@@ -56,8 +57,7 @@ def distances(belief: Belief, nodes: Nodes, noise: Array) -> Array:
         belief.pose, belief.places, belief.kind
     )
     across = belief.cross_cov.reshape(3, size, 2).transpose(1, 0, 2)  # (L, 3, 2)
-    index = jnp.arange(size, dtype=jnp.int32)
-    own = belief.map_cov.reshape(size, 2, size, 2)[index, :, index]  # (L, 2, 2)
+    own = blocks_of(belief.map_cov)
     mixed = jnp.einsum("lij,ljk,lmk->lim", by_pose, across, by_slot)
     spread = jnp.einsum("lij,jk,lmk->lim", by_pose, belief.pose_cov, by_pose)
     spread += mixed + jnp.swapaxes(mixed, 1, 2)
@@ -156,7 +156,7 @@ def second_look(
         (xy[:, None, 0] - xy[None, :, 0]) ** 2 + (xy[:, None, 1] - xy[None, :, 1]) ** 2 + 1e-6
     )
     seen, known = apart(nodes.xy), apart(belief.places[rows.slot])
-    variance = belief.map_cov.reshape(size, 2, size, 2)[rows.slot][:, :, rows.slot]
+    variance = rows_at(belief.map_cov, rows.slot).reshape(m, 2, size, 2)[:, :, rows.slot]
     own = variance[index, :, index]
     trace = lambda x: x[..., 0, 0] + x[..., 1, 1]
     of_map = trace(own)[:, None] + trace(own)[None] - 2 * trace(jnp.moveaxis(variance, 2, 1))
@@ -200,10 +200,10 @@ def twin(spec: MatchSpec, belief: Belief, slot: Array) -> Array:
     at = jnp.minimum(slot, size - 1)
     place, kind, shape = belief.places, belief.kind, belief.shape
     x, y = (place - place[at][None]).T
-    blocks = belief.map_cov.reshape(size, 2, size, 2)
-    index = jnp.arange(size, dtype=jnp.int32)
-    across = blocks[at].transpose(1, 0, 2)  # (L, 2, 2) of the slot and each
-    s = blocks[index, :, index] + blocks[at, :, at][None] - across - jnp.swapaxes(across, 1, 2)
+    own, index = blocks_of(belief.map_cov), jnp.arange(size, dtype=jnp.int32)
+    # (L, 2, 2) of the slot and each.
+    across = rows_at(belief.map_cov, at[None]).reshape(2, size, 2).transpose(1, 0, 2)
+    s = own + own[at][None] - across - jnp.swapaxes(across, 1, 2)
     distance = _square(s[:, 0, 0] + 1e-4, s[:, 0, 1], s[:, 1, 1] + 1e-4, x, y)
     facing = belief.direction - belief.direction[at]
     same = _resemble(kind, shape, shape[at], facing, shape=spec.shape, turn=spec.turn)

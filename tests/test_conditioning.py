@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import conditioning
+from jaxslam import covariance
 from jaxslam.conditioning import Blocks, Rows, condition
 
 L, M = 5, 3
@@ -60,7 +60,7 @@ def ours(cov, rows):
 @pytest.mark.parametrize("large", [0, 10**6], ids=["zeros left out", "all at once"])
 @pytest.mark.parametrize("used", [M, 1, 0])
 def test_it_is_the_textbooks(used, large, monkeypatch):
-    monkeypatch.setattr(conditioning, "LARGE", large)
+    monkeypatch.setattr(covariance, "LARGE", large)
     cov, rows = problem(used, used=used)
     fresh = lambda *given: ours(*given)  # what was compiled before knows another number
     for mine, theirs in zip(jax.jit(fresh)(cov, rows), textbook(cov, rows), strict=True):

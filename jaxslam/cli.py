@@ -28,6 +28,7 @@ from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.tuning import tune
 from jaxslam.types import NODE
+from jaxslam.view import View
 from jaxslam.world import World
 
 AREA = 1.0  # [m^2] of the smallest region of a map that is drawn
@@ -122,6 +123,7 @@ def run(
     odometry_topic: str | None = None,
     scan: int | None = None,
     animate: bool = False,
+    view: Literal["live", "file"] | None = None,
     out: Path = Path("out"),
 ) -> None:
     """Run SLAM on a recorded log.
@@ -142,6 +144,8 @@ def run(
         odometry_topic: Topic of the odometry in a bag, or of the transforms; likewise.
         scan: Number of a scan, from 0, whose local diagram is drawn: scan.png.
         animate: Film the run: run.gif.
+        view: Show the run as it goes on in rerun's viewer, or write run.rrd for it; needs the
+            extra [view].
         out: Folder for the results.
     """
     recording = readers.read(log, scans=scan_topic, odometry=odometry_topic)
@@ -167,7 +171,11 @@ def run(
         )
         with stopwatch() as seconds:
             given = config, assumed, jnp.zeros(3), motions, scans
-            survey = _map(*given, aligned=by_scans)
+            shown = None
+            if view is not None:
+                file = place / "run.rrd" if view == "file" else None
+                shown = View(config, recording.times, scans, file)
+            survey = _map(*given, aligned=by_scans, view=shown)
             poses = report.poses_of(survey)
         numbers = {
             "scans": len(poses),
@@ -200,7 +208,7 @@ def run(
     report.tell(numbers, f"{len(poses)} scans of {log}", out)
 
 
-def _map(*given: Any, aligned: bool) -> Survey:
+def _map(*given: Any, aligned: bool, view: View | None) -> Survey:
     """`online.survey` of a log, which shows how far it is."""
     with tqdm(total=len(given[3]), unit="scan", desc="compiling", mininterval=0.2) as bar:
 
@@ -209,8 +217,13 @@ def _map(*given: Any, aligned: bool) -> Survey:
             found = int(np.sum(slam.confirmed(given[0], mapper.belief)))
             bar.set_postfix_str(f"{found} landmarks", refresh=False)
             bar.update(len(part.info.finite))
+            if view is not None:
+                view.watch(mapper, part)
 
-        return online.survey(*given, aligned=aligned, watch=watch)
+        survey = online.survey(*given, aligned=aligned, watch=watch)
+    if view is not None:
+        view.end(survey.graph)
+    return survey
 
 
 def map_grid(

@@ -219,7 +219,7 @@ def tell(numbers: Numbers, title: str, out: Path) -> None:
     """Print a summary of what `metrics.json` holds."""
     print(f"\n{title}; a way of {numbers['path_length_m']:.0f} m")
     if numbers.get("skipped_lines"):
-        print(f"{numbers['skipped_lines']} broken lines of the log were skipped")
+        print(f"{numbers['skipped_lines']} broken lines, or scans without odometry, were left out")
     for what in numbers.get("mended", ()):
         print(f"note: {what}")
     blind = numbers.get("dead_reckoning", {})

@@ -13,7 +13,7 @@ ORDER = (
     "circles nodes sensor noise junctions links alignment association covariance belief "
     "conditioning ekf recognition arrow ways topomap medial skeleton slam online smoother plan "
     "poses metrics monte_carlo losses descent fit curvature io logs mapping plot report options "
-    "tuning film cli"
+    "tuning film view cli"
 ).split()
 DOORS = {"__init__", "__main__"}  # may import everything
 FILES = sorted(HOME.rglob("*.py"))

@@ -1,0 +1,121 @@
+import importlib.util
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import lidar, online, slam, view, world
+from jaxslam.io.errors import InputError
+from jaxslam.lidar import Lidar
+from jaxslam.slam import Config
+
+LIDAR = Lidar(beams=61, first=-np.pi / 2, step=np.pi / 60)
+CONFIG = Config(lidar=LIDAR, landmarks=24, confirm=2)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Scans [T] of a robot that turns in a room, their times, and what `online.survey` tells."""
+    poses = np.stack([np.full(6, 2.5), np.full(6, 2.0), 0.1 * np.arange(6)], axis=1)
+    cast = jax.vmap(lidar.cast, in_axes=(None, 0, None))
+    scans = cast(world.named("fig07"), jnp.asarray(poses), LIDAR)
+    motions = np.array([[0.0, 0.0, 0.0]] + [[0.0, 0.0, 0.1]] * 5)
+    told, start = [], jnp.asarray(poses[0])
+    watch = lambda *now: told.append(now)
+    survey = online.survey(CONFIG, slam.log_noise(), start, motions, scans, watch=watch)
+    return 100.0 + np.arange(6.0), scans, told, survey
+
+
+class Stream:
+    """Stands for rerun's stream, and keeps what it is told."""
+
+    def __init__(self, name):
+        self.time, self.told, self.target = {}, [], None
+        Stream.last = self
+
+    def spawn(self):
+        self.target = "viewer"
+
+    def save(self, file):
+        self.target = file
+
+    def set_time(self, name, **value):
+        self.time[name] = next(iter(value.values()))
+
+    def log(self, name, what, static=False):
+        self.told.append((name, dict(self.time), what))
+
+    def disconnect(self):
+        self.closed = True
+
+
+@pytest.fixture
+def rerun(monkeypatch):
+    """A stand-in for rerun: a shape is what it was given."""
+    shape = lambda *given, **look: (given, look)
+    names = ("Arrows3D", "LineStrips3D", "Points3D")
+    views = SimpleNamespace(RIGHT_HAND_Z_UP="z up")
+    kinds = dict.fromkeys(names, shape)
+    fake = SimpleNamespace(RecordingStream=Stream, ViewCoordinates=views, **kinds)
+    monkeypatch.setitem(sys.modules, "rerun", fake)
+    monkeypatch.setattr(view, "find_spec", lambda name: True)
+
+
+def test_each_scan_is_shown_where_it_was_made(drive, rerun, tmp_path):
+    times, scans, told, survey = drive
+    shown = view.View(CONFIG, times, scans, tmp_path / "run.rrd")
+    for now in told:
+        shown.watch(*now)
+    shown.end(survey.graph)
+    stream = Stream.last
+    assert stream.target == tmp_path / "run.rrd" and stream.closed
+    seen = [(time, what) for name, time, what in stream.told if name == "world/scan"]
+    assert [time for time, _ in seen] == [{"scan": k, "time": float(k)} for k in range(6)]
+    for k, (_, ((points,), _)) in enumerate(seen):
+        x, y, turn = np.asarray(survey.info.pose[k])
+        c, s = np.cos(turn), np.sin(turn)
+        own = np.asarray(lidar.points(jax.tree.map(lambda x: x[k], scans), LIDAR))  # noqa: B023
+        own = own[np.asarray(scans.hit[k])]
+        assert not points[:, 2].any()
+        np.testing.assert_allclose(
+            points[:, :2], own @ np.array([[c, s], [-s, c]]) + [x, y], atol=1e-9
+        )
+    last = {name: what for name, _, what in stream.told}
+    np.testing.assert_allclose(last["world/path"][0][0][0][:, :2], survey.info.pose[:, :2])
+    assert len(last["world/map/arcs"][0][0]) == len(survey.graph.lines)
+    counts = np.asarray(slam.confirmed(CONFIG, survey.belief))
+    corners = counts & (np.asarray(survey.belief.kind) == 1)
+    assert corners.sum() > 2
+    dots = last["world/map/corners"][0][0][:, :2]
+    np.testing.assert_allclose(dots, survey.belief.places[corners])
+    # An ellipse holds what is three standard deviations off, in all directions.
+    size = survey.belief.seen.size
+    at = int(np.flatnonzero(corners)[0])
+    own = np.asarray(survey.belief.map_cov).reshape(size, 2, size, 2)[at, :, at]
+    off = last["world/map/corners/ellipses"][0][0][0][:, :2] - np.asarray(survey.belief.places[at])
+    norm = np.einsum("ni,ij,nj->n", off, np.linalg.inv(own), off)
+    np.testing.assert_allclose(norm, 9.0, rtol=1e-6)
+
+
+def test_without_a_file_the_viewer_is_opened(drive, rerun):
+    view.View(CONFIG, drive[0], drive[1], None)
+    assert Stream.last.target == "viewer"
+
+
+def test_without_rerun_it_is_told_what_to_install(drive, monkeypatch):
+    monkeypatch.setattr(view, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'jaxslam\[view\]'"):
+        view.View(CONFIG, drive[0], drive[1], None)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed")
+def test_rerun_takes_what_it_is_told(drive, tmp_path):
+    times, scans, told, survey = drive
+    shown = view.View(CONFIG, times, scans, tmp_path / "run.rrd")
+    for now in told:
+        shown.watch(*now)
+    shown.end(survey.graph)
+    assert (tmp_path / "run.rrd").stat().st_size > 1000

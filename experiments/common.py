@@ -4,8 +4,9 @@ import argparse
 import hashlib
 import json
 import shutil
+import sys
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import jaxslam
 from jaxslam import slam, voronoi, world
 from jaxslam.grid import GridSpec, centres
+from jaxslam.io.errors import InputError
 from jaxslam.io.output import plain, write_json
 from jaxslam.lidar import Lidar, Scan, cast
 
@@ -52,6 +54,31 @@ def parse(description: str | None, argv: list[str] | None = None, **extra: Any):
     for name, default in extra.items():
         parser.add_argument(f"--{name}", type=type(default), default=default)
     return parser.parse_args(argv)
+
+
+def ended(name: str, *more: type[Exception]) -> Callable[[Callable], Callable]:
+    """Decorator of a `main` that returns its exit code: what cannot be done is one line and 2.
+
+    Args:
+        name: Of the experiment.
+        more: Errors that are told, beside InputError; Ctrl-C is 130.
+    """
+
+    def decorate(main: Callable[[list[str] | None], int]) -> Callable[[list[str] | None], int]:
+        @wraps(main)
+        def run(argv: list[str] | None = None) -> int:
+            try:
+                return main(argv)
+            except (InputError, *more) as error:
+                print(f"{name}: error: {error}", file=sys.stderr)
+                return 2
+            except KeyboardInterrupt:
+                print(f"{name}: interrupted; the same command goes on", file=sys.stderr)
+                return 130
+
+        return run
+
+    return decorate
 
 
 class Kept:

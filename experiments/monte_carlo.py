@@ -248,30 +248,24 @@ def compute(
     return results[0] | {"peak_mb": sum(one["peak_mb"] for one in results)}
 
 
+@common.ended(NAME, processes.Lost)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
     flags = {"processes": 1, "coordinator_address": "", "num_processes": 0, "process_id": -1}
     given = common.parse(__doc__, argv, runs=10_000, replay=-1, **flags)
     folder = given.out / f"{NAME}_runs"
-    try:
-        if given.runs < 1:
-            raise InputError("is not positive", field="--runs")
-        case = office(given.seed)
-        if given.replay >= 0:
-            told = replay(case, given.replay)
-            print({key: told[key] for key in ("run", "position_rmse_m", "diverged", "nonfinite")})
-            return 0
-        numbers = compute(case, given.runs, folder, together(given))
-        if numbers is None:
-            print("done; process 0 has the results")
-            return 0
-        numbers |= {"scaling": scaling.compute(given.seed)}
-    except (InputError, processes.Lost) as error:
-        print(f"{NAME}: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
-        return 130
+    if given.runs < 1:
+        raise InputError("is not positive", field="--runs")
+    case = office(given.seed)
+    if given.replay >= 0:
+        told = replay(case, given.replay)
+        print({key: told[key] for key in ("run", "position_rmse_m", "diverged", "nonfinite")})
+        return 0
+    numbers = compute(case, given.runs, folder, together(given))
+    if numbers is None:
+        print("done; process 0 has the results")
+        return 0
+    numbers |= {"scaling": scaling.compute(given.seed)}
     common.save(given.out, NAME, numbers, draw)
     shutil.rmtree(folder, ignore_errors=True)
     shown = "position_rmse_m", "p50_m", "p95_m", "p99_m", "diverged", "nonfinite", "peak_mb"

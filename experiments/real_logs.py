@@ -247,22 +247,16 @@ def _draw_rows(axis: Any, rows: list[common.Numbers]) -> None:
     axis.legend(fontsize="small")
 
 
+@common.ended(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
     options = common.parse(__doc__, argv, data="", tune=1)
     keep_compiled()
     kept = common.Kept(options.out / f"{NAME}_parts", {"data": options.data})
-    try:
-        folder = Path(options.data) if options.data else None
-        if folder is not None and not folder.is_dir():
-            raise InputError("is no folder", path=folder, advice="name the folder of the logs")
-        numbers = compute(folder, bool(options.tune), kept)
-    except InputError as error:
-        print(f"{NAME}: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
-        return 130
+    folder = Path(options.data) if options.data else None
+    if folder is not None and not folder.is_dir():
+        raise InputError("is no folder", path=folder, advice="name the folder of the logs")
+    numbers = compute(folder, bool(options.tune), kept)
     common.save(options.out, NAME, {"seed": options.seed} | numbers, draw)
     kept.clear()
     return 0

@@ -19,7 +19,6 @@ from jaxslam import fit, monte_carlo, slam
 from jaxslam import logs as log_of
 from jaxslam.batches import use_cores
 from jaxslam.io import mrclam
-from jaxslam.io.errors import InputError
 from jaxslam.losses import calibrated, likelihood
 from jaxslam.noise import log_noise, sighting_noise
 from jaxslam.options import keep_compiled
@@ -170,6 +169,7 @@ def _draw_traces(axis: Any, numbers: common.Numbers, data: str, over: str) -> No
     axis.legend(fontsize="small")
 
 
+@common.ended(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
     sizes = {"runs": 32, "heldout": 64, "starts": 20, "recovery_runs": 256}
@@ -179,25 +179,18 @@ def main(argv: list[str] | None = None) -> int:
     about = {key: str(value) for key, value in vars(given).items() if key != "out"}
     kept = common.Kept(given.out / f"{NAME}_parts", about)
     rows, traces = [], {}
-    try:
-        tasks = {"office": lambda: office(given.seed, given.runs, given.heldout)}
-        if given.mrclam:
-            robots = recorded(Path(given.mrclam))
-            tasks["mrclam"] = lambda: robots
-        for data, make in tasks.items():
-            task = make()
-            more, traces[data] = compare(data, task, given.seed, STEPS[data], kept)
-            rows += more
-            if data == "office":
-                step = kept("a step", lambda task=task: step_seconds(task))
-        sizes = given.starts, given.recovery_runs, given.heldout
-        told = recovery.compute(given.seed, *sizes, kept)
-    except InputError as error:
-        print(f"{NAME}: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{NAME}: interrupted; the same command goes on", file=sys.stderr)
-        return 130
+    tasks = {"office": lambda: office(given.seed, given.runs, given.heldout)}
+    if given.mrclam:
+        robots = recorded(Path(given.mrclam))
+        tasks["mrclam"] = lambda: robots
+    for data, make in tasks.items():
+        task = make()
+        more, traces[data] = compare(data, task, given.seed, STEPS[data], kept)
+        rows += more
+        if data == "office":
+            step = kept("a step", lambda task=task: step_seconds(task))
+    sizes = given.starts, given.recovery_runs, given.heldout
+    told = recovery.compute(given.seed, *sizes, kept)
     numbers = {"seed": given.seed, "rows": rows, "recovery": told, "step": step, "traces": traces}
     common.save(given.out, NAME, numbers, draw)
     kept.clear()

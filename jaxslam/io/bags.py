@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxslam.io.errors import InputError
 from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
+from jaxslam.io.text import shown
 from jaxslam.lidar import Lidar
 from jaxslam.poses import composed, interpolate
 
@@ -146,7 +147,9 @@ def _recording(path: str | PathLike, bag: Any, chosen: Choice, reach: float) -> 
         for one in bag.connections
         if one.topic in chosen or (one.msgtype in TRANSFORMS and "tf" in one.topic)
     ]
-    for connection, _, raw in bag.messages(connections=wanted):
+    count = sum(one.msgcount for one in wanted)
+    messages = bag.messages(connections=wanted)
+    for connection, _, raw in shown(messages, Path(path), "message", count):
         message = bag.deserialize(raw, connection.msgtype)
         if connection.topic == chosen.scans:
             one = _scan(message, reach)

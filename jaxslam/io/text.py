@@ -4,15 +4,22 @@ import gzip
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+from tqdm import tqdm
 
 from jaxslam.io.errors import InputError
+
+
+def shown(items: Iterable, path: Path, unit: str, total: int | None = None) -> Iterable:
+    """The items of a file; on a terminal, how far the reading is when it takes its time."""
+    look = {"unit": unit, "total": total, "leave": False, "delay": 1.0, "disable": None}
+    return tqdm(items, desc=f"reading {path.name}", unit_scale=True, **look)
 
 
 def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
@@ -36,7 +43,7 @@ def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
             if b"\0" in head:
                 raise InputError("is binary", path=path, advice="name a text file")
             file.seek(0)
-            for number, line in enumerate(file, start=1):
+            for number, line in enumerate(shown(file, path, "line"), start=1):
                 yield number, line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
     except FileNotFoundError:
         raise InputError("does not exist", path=path, advice="check the name") from None

@@ -5,9 +5,12 @@ import pytest
 
 from jaxslam import alignment, lidar, online, slam, topomap, world
 from jaxslam.alignment import AlignSpec
+from jaxslam.geometry import unit
 from jaxslam.lidar import Lidar
 from jaxslam.poses import seen_from
 from jaxslam.slam import Config, Inputs
+from jaxslam.types import WALL
+from jaxslam.world import World
 
 T = 11
 LIDAR = Lidar(beams=91, first=-np.pi / 2, step=np.pi / 90)
@@ -121,6 +124,24 @@ def test_a_log_of_another_length_needs_no_other_program(drive, surveys):
     size = slam.local_maps._cache_size(), online._steps._cache_size()
     online.survey(CONFIG, NOISE, START, motions[:6], jax.tree.map(lambda x: x[:6], scans))
     assert (slam.local_maps._cache_size(), online._steps._cache_size()) == size
+
+
+def test_a_room_of_six_walls_has_three_wall_directions():
+    corner = 4.0 * unit(jnp.arange(6.0) * jnp.pi / 3 + 0.2)
+    walls = World(jnp.concatenate([corner, jnp.roll(corner, -1, axis=0)], axis=1))
+    turn = np.linspace(0.0, 2 * np.pi, 32)
+    poses = np.stack([np.cos(turn), np.sin(turn), turn + np.pi / 2], axis=1)
+    cast = jax.vmap(lidar.cast, in_axes=(None, 0, None))
+    clean = cast(walls, jnp.asarray(poses), LIDAR)
+    keys = jax.random.split(jax.random.key(1), len(turn))
+    scans = jax.vmap(lidar.disturb, in_axes=(0, 0, None))(keys, clean, LIDAR)
+    motions = np.concatenate([np.zeros((1, 3)), seen_from(poses[:-1], poses[1:])])
+    found = online.survey(CONFIG, slam.log_noise(), jnp.asarray(poses[0]), motions, scans).belief
+    walls = np.asarray(slam.confirmed(CONFIG, found) & (found.kind == WALL))
+    told = np.sort(np.degrees(np.asarray(found.places)[walls, 0]) % 180.0)
+    # A wall is seen along its length, a third of the way round from the next.
+    want = np.sort((np.degrees(0.2) + 120.0 + 60.0 * np.arange(3)) % 180.0)
+    np.testing.assert_allclose(told, want, atol=1.0)
 
 
 @pytest.mark.parametrize("count", [0, 5])

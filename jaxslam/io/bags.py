@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
+from jaxslam.io.recording import NOISE, REACH, TOLERATED, Recording, no_return
 from jaxslam.io.text import shown
 from jaxslam.lidar import Lidar
 from jaxslam.poses import composed, interpolate
@@ -58,7 +58,7 @@ def is_bag(path: Path) -> bool:
 def read(
     path: str | PathLike,
     *,
-    reach: float = 20.0,
+    reach: float = REACH,
     scans: str | None = None,
     odometry: str | None = None,
 ) -> Recording:

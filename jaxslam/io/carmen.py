@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, TOLERATED, Recording, no_return
+from jaxslam.io.recording import NOISE, REACH, TOLERATED, Recording, no_return
 from jaxslam.io.robotlaser import Laser
 from jaxslam.io.text import lines, number
 from jaxslam.io.wheels import foreign, without_jumps
@@ -32,7 +32,7 @@ _FORMS = {
 }
 
 
-def read(path: str | PathLike, *, reach: float = 20.0) -> Recording:
+def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
     """Read a CARMEN log, plain or gzipped, in file order.
 
     Args:

@@ -9,12 +9,10 @@ from typing import NamedTuple
 
 from jaxslam.io import bags, carmen, g2o, npz
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import Recording
+from jaxslam.io.recording import REACH, Recording
 from jaxslam.io.text import lines
 
 LOOK = 1000  # lines in which the first of a known kind must come
-REACH = 20.0
-"""Range [m] from which on a reading of an indoor scanner counts as no return."""
 
 _WORDS = {b"VERTEX_SE2": g2o, b"EDGE_SE2": g2o, b"VERTEX_XY": g2o}
 _WORDS |= dict.fromkeys((b"FLASER", b"ODOM", b"ROBOTLASER1", b"PARAM", b"RLASER"), carmen)

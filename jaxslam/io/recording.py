@@ -9,6 +9,9 @@ from jaxslam.lidar import Lidar
 NOISE = 0.02
 """Standard deviation [m] of a range; no log says it."""
 
+REACH = 20.0
+"""Range [m] from which on a reading of an indoor scanner counts as no return."""
+
 TOLERATED = 0.05
 """Part of a log's lines or scans that may be broken: they are left out and counted."""
 
@@ -23,7 +26,7 @@ class Recording(NamedTuple):
     odometry: np.ndarray  # (T, 3) float64 [m, m, rad] wheel pose of each scan
     ranges: np.ndarray  # (T, R) float32 [m]; inf where nothing returned
     lidar: Lidar
-    skipped: int  # broken lines left out
+    skipped: int  # broken lines, or scans without odometry, left out
     wheel_times: np.ndarray  # (N,) float64 [s] of the whole stream of wheel poses
     wheel_poses: np.ndarray  # (N, 3) float64 [m, m, rad]; the scans' own if there is no stream
     source: str = ""  # what of the log it is, where there was a choice

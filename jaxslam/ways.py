@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 from scipy.sparse import csgraph
 
 POINTS = 9  # of a line that is compared or made of a drive
@@ -63,18 +64,19 @@ def split(way: Way, xy: np.ndarray, near: np.ndarray) -> list[Way]:
         xy: (N, 2) [m] of the nodes.
         near: (N,) [m] how close it must come to each.
     """
-    whole = size(way.line)
-    away, along = beside(xy, way.line)
+    whole, room = size(way.line), near[:, None]
+    about = (way.line.min(axis=0) - room < xy) & (xy < way.line.max(axis=0) + room)
+    some = np.setdiff1d(np.flatnonzero(about.all(axis=1)), (way.a, way.b))
+    away, along = beside(xy[some], way.line)
     ends = way.line[[0, -1]] if way.b >= 0 else way.line[:1]
-    far = np.min(np.linalg.norm(xy[:, None] - ends, axis=2), axis=1)
-    passed = (away < np.minimum(near, ASIDE * far)) & (along > STUB)
+    far = np.min(np.linalg.norm(xy[some, None] - ends, axis=2), axis=1)
+    passed = (away < np.minimum(near[some], ASIDE * far)) & (along > STUB)
     passed &= (along < whole - STUB) | (way.b < 0)
-    passed[[k for k in (way.a, way.b) if k >= 0]] = False
-    stops = sorted(np.flatnonzero(passed), key=lambda k: along[k])
-    if not stops:
+    passed = np.flatnonzero(passed)[np.argsort(along[passed], kind="stable")]
+    if not passed.size:
         return [way]
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way.line, axis=0), axis=1))])
-    cuts = [0.0, *along[stops], whole]
+    cuts, stops = [0.0, *along[passed], whole], some[passed]
     names = [way.a, *map(int, stops), way.b]
     places = [way.line[0], *xy[stops], way.line[-1]]
     parts = []
@@ -93,8 +95,11 @@ def merge(ways: Sequence[Way], apart: float) -> list[Way]:
     Of such, the one seen most often stands, with the smallest clearance of all.
     """
     found: list[Way] = []
+    between: dict[tuple[int, int], list[int]] = {}  # those found, by their ends
     for way in sorted(ways, key=lambda way: -way.seen):
-        for k, known in enumerate(found):
+        rivals = between.setdefault((min(way.a, way.b), max(way.a, way.b)), [])
+        for k in rivals:
+            known = found[k]
             turned = [w for w in (way, reverse(way)) if (w.a, w.b) == (known.a, known.b)]
             gaps = [np.linalg.norm(evenly(w.line) - evenly(known.line), axis=1) for w in turned]
             if any(gap.max() < apart for gap in gaps):
@@ -102,6 +107,7 @@ def merge(ways: Sequence[Way], apart: float) -> list[Way]:
                 found[k] = known._replace(clearance=narrow, seen=known.seen + way.seen)
                 break
         else:
+            rivals.append(len(found))
             found.append(way)
     return found
 
@@ -127,17 +133,19 @@ def shortest(
     pairs, lengths = np.asarray(pairs, int).reshape(-1, 2), np.asarray(lengths, float)
     if lengths.shape != (len(pairs),) or np.any(lengths < 0) or np.any(np.isnan(lengths)):
         raise ValueError(f"lengths {lengths.shape} must be numbers >= 0, one of {len(pairs)} arcs")
-    table = np.full((places, places), np.inf)
-    np.minimum.at(table, tuple(pairs.T), lengths)
-    table = np.minimum(table, table.T)
-    joined = csgraph.csgraph_from_dense(table, null_value=np.inf)
-    before = csgraph.dijkstra(joined, indices=start, return_predecessors=True)[1]
+    # The shortest of parallel arcs; the sparse matrix would add them up.
+    ends = np.sort(pairs, axis=1)
+    order = np.argsort(lengths, kind="stable")[: np.count_nonzero(lengths < np.inf)]
+    order = order[np.unique(ends[order] @ [places, 1], return_index=True)[1]]
+    joined = sparse.csr_array((lengths[order], ends[order].T), shape=(places, places))
+    how = {"directed": False, "indices": start, "return_predecessors": True}
+    before = csgraph.dijkstra(joined, **how)[1]
     way, here = [], int(goal)
     while here != start:
         last = int(before[here])
         if last < 0:
             raise ValueError(f"no route leads from place {start} to place {goal}")
-        between = np.flatnonzero(np.all(np.sort(pairs, axis=1) == sorted((last, here)), axis=1))
+        between = np.flatnonzero(np.all(ends == sorted((last, here)), axis=1))
         way.append(int(between[np.argmin(lengths[between])]))
         here = last
     return way[::-1]
@@ -204,27 +212,27 @@ def add_driven(
         apart: Distance [m] between the way out and the way back around something, at least.
     """
     known = list(known)
+    bounds = lambda line: np.concatenate([line.min(axis=0), -line.max(axis=0)])
+    extents = [bounds(way.line) for way in known]
+
+    def learn(way: Way) -> None:
+        known.append(way)
+        extents.append(bounds(way.line))
+
     for way in driven:
         room = max(BESIDE, clearance[way.a], clearance[way.b])
         if way.a == way.b:
             around = np.linalg.norm(way.line - way.line[::-1], axis=1).max() > 2 * apart
             others = [w.line for w in known if w.a == w.b == way.a]
             if around and all(beside(way.line, line)[0].max() > room for line in others):
-                known.append(way)
+                learn(way)
             continue
         pairs = np.array([[w.a, w.b] for w in known], int).reshape(-1, 2)
         lengths = np.array([w.length for w in known])
-        lines = [w.line for w in known]
         # An arc that the drive did not keep beside is none that it followed.
-        low, high = way.line.min(axis=0) - room, way.line.max(axis=0) + room
-        inside = [(low <= line).all() and (line <= high).all() for line in lines]
-        close = np.array(
-            [
-                near and beside(line, way.line)[0].max() < room
-                for near, line in zip(inside, lines, strict=True)
-            ],
-            bool,
-        )
+        close = np.all(np.reshape(extents, (-1, 4)) >= bounds(way.line) - room, axis=1)
+        for k in np.flatnonzero(close):
+            close[k] = beside(known[k].line, way.line)[0].max() < room
         try:
             arcs = shortest(
                 pairs, np.where(close, lengths, np.inf), way.a, way.b, places=len(clearance)
@@ -232,7 +240,7 @@ def add_driven(
         except ValueError:
             arcs = None
         if arcs is None or lengths[arcs].sum() > DETOUR[0] * way.length + DETOUR[1]:
-            known.append(way)
+            learn(way)
     return known
 
 

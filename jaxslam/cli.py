@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,13 @@ from jaxslam.io import graphml, occupancy, readers, tum
 from jaxslam.io import relations as relations_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
+from jaxslam.lidar import Scan
 from jaxslam.monte_carlo import Track
 from jaxslam.motion import Robot
 from jaxslam.online import Mapper, Part, Survey
 from jaxslam.options import keep_compiled, named, noise_of, stopwatch, within
 from jaxslam.poses import seen_from
-from jaxslam.slam import Config
+from jaxslam.slam import Config, Noise
 from jaxslam.tuning import tune
 from jaxslam.types import NODE
 from jaxslam.view import View
@@ -170,12 +171,11 @@ def run(
             flush=True,
         )
         with stopwatch() as seconds:
-            given = config, assumed, jnp.zeros(3), motions, scans
             shown = None
             if view is not None:
                 file = place / "run.rrd" if view == "file" else None
                 shown = View(config, recording.times, scans, file)
-            survey = _map(*given, aligned=by_scans, view=shown)
+            survey = _map(config, assumed, motions, scans, aligned=by_scans, view=shown)
             poses = report.poses_of(survey)
         numbers = {
             "scans": len(poses),
@@ -196,8 +196,8 @@ def run(
             numbers |= report.against_relations(recording, poses, verified)
         numbers |= {"dead_reckoning": blind} if blind else {}
         report.write(place, numbers, recording.times, survey)
-        told = jax.tree.map(jnp.asarray, (jnp.asarray(motions, float), survey.nodes))
-        inputs = slam.Inputs(*told, aligned=survey.aligned)
+        told = jnp.asarray(motions, float)
+        inputs = slam.Inputs(told, survey.nodes, aligned=survey.aligned)
         config = config._replace(landmarks=survey.belief.seen.size)
         report.write_maps(place, config, assumed, survey, inputs, scans)
         report.draw(place, config, survey, lines, error, scans=scans)
@@ -208,18 +208,27 @@ def run(
     report.tell(numbers, f"{len(poses)} scans of {log}", out)
 
 
-def _map(*given: Any, aligned: bool, view: View | None) -> Survey:
+def _map(
+    config: Config,
+    noise: Noise,
+    motions: np.ndarray,
+    scans: Scan,
+    *,
+    aligned: bool,
+    view: View | None,
+) -> Survey:
     """`online.survey` of a log, which shows how far it is."""
-    with tqdm(total=len(given[3]), unit="scan", desc="compiling", mininterval=0.2) as bar:
+    with tqdm(total=len(motions), unit="scan", desc="compiling", mininterval=0.2) as bar:
 
         def watch(mapper: Mapper, part: Part) -> None:
             bar.set_description("mapping", refresh=False)
-            found = int(np.sum(slam.confirmed(given[0], mapper.belief)))
+            found = int(np.sum(slam.confirmed(config, mapper.belief)))
             bar.set_postfix_str(f"{found} landmarks", refresh=False)
             bar.update(len(part.info.finite))
             if view is not None:
                 view.watch(mapper, part)
 
+        given = config, noise, jnp.zeros(3), motions, scans
         survey = online.survey(*given, aligned=aligned, watch=watch)
     if view is not None:
         view.end(survey.graph)

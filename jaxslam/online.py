@@ -171,23 +171,23 @@ def align(config: Config, scans: Scan, motions: Array) -> Aligned:
     local, parts = alignment.empty(config.alignment, config.lidar), []
     for first in range(0, len(motions), STRETCH):
         some = jax.tree.map(lambda x: x[first : first + STRETCH], (scans, motions))  # noqa: B023
-        given = (*jax.tree.map(_real, pad(some, to=STRETCH)), jnp.int32(len(some[1])))
-        local, part = alignment.follow(config.alignment, config.lidar, local, *given)
+        local, part = alignment.follow(config.alignment, config.lidar, local, *_filled(*some))
         parts.append(part)
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(motions)], *parts)
 
 
-def _real(x: np.ndarray) -> Array:
-    """An array of JAX's, in its precision."""
-    return jnp.asarray(x, float if x.dtype.kind == "f" else None)
+def _filled(scans: Scan, motions: np.ndarray) -> tuple[Scan, Array, Array]:
+    """Scans and motions of a stretch, filled up, in JAX's precision, and how many () there are."""
+    real = lambda x: jnp.asarray(x, float if x.dtype.kind == "f" else None)
+    return *jax.tree.map(real, pad((scans, motions), to=STRETCH)), jnp.int32(len(motions))
 
 
 def _look(config: Config, local: LocalMap | None, motions: np.ndarray, scans: Scan) -> _Seen:
     """Features, links and, with a local map of scans, aligned motions of a stretch."""
     if not 1 <= len(motions) <= STRETCH:
         raise ValueError(f"{len(motions)} scans; a stretch has 1 to {STRETCH}")
-    count, aligned = jnp.int32(len(motions)), None
-    motions, scans = jax.tree.map(_real, pad((motions, scans), to=STRETCH))
+    scans, motions, count = _filled(scans, motions)
+    aligned = None
     with ThreadPoolExecutor(1) as other:  # neither waits for the other, to be compiled or to run
         features = other.submit(slam.local_maps, config, scans)
         if local is not None:

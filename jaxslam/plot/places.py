@@ -10,6 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.transforms import Affine2D
 
 from jaxslam.belief import Belief
+from jaxslam.covariance import blocks_of
 from jaxslam.grid import GridSpec
 from jaxslam.io.occupancy import Occupancy
 from jaxslam.nodes import Nodes
@@ -106,9 +107,7 @@ def ellipses(axis: Axes, xy: np.ndarray, cov: np.ndarray, color: str) -> None:
 def landmarks(axis: Axes, belief: Belief, *, confirm: int) -> None:
     """Draw nodes and corners of a belief that were seen `confirm` times, with their covariance."""
     seen, kind = np.asarray(belief.seen), np.asarray(belief.kind)
-    place, cov = np.asarray(belief.places), np.asarray(belief.map_cov)
-    size, index = len(seen), np.arange(len(seen))
-    own = cov.reshape(size, 2, size, 2)[index, :, index]
+    place, own = np.asarray(belief.places), np.asarray(blocks_of(belief.map_cov))
     for which in MARKS:
         _marks(axis, place, own, (seen >= confirm) & (kind == which), which)
 

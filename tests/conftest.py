@@ -5,10 +5,12 @@ import jax
 import pytest
 
 # Most of the time of these tests is XLA's compiler, and what they run is small. The old emitters
-# take half of its time; they may go with a next version, and an unknown flag ends the process.
+# take half of its time, and a program in one piece less than in several, the cores being busy;
+# both flags may go with a next version, and an unknown flag ends the process.
 FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 FLAGS += " --xla_force_host_platform_device_count=2"
-OLD = " --xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
+OLD = " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+OLD = OLD if jax.__version_info__ < (0, 11) else ""
 os.environ.setdefault("XLA_FLAGS", FLAGS + OLD)
 
 jax.config.update("jax_enable_x64", True)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,7 @@ STEPS = 16
 CORRIDOR = World(jnp.array([[-60.0, 1.0, 60.0, 1.0], [60.0, -1.2, -60.0, -1.2]]))
 
 
+@partial(jax.jit, static_argnames="noise")
 def scans_of(place, poses, noise=0.0, seed=0):
     """Scans [T] from poses (T, 3)."""
     seen = jax.vmap(lidar.cast, in_axes=(None, 0, None))(place, poses, LIDAR)
@@ -25,6 +28,7 @@ def scans_of(place, poses, noise=0.0, seed=0):
     return jax.vmap(lidar.disturb, in_axes=(0, 0, None))(keys, seen, loud)
 
 
+@jax.jit
 def motions_of(poses):
     return jnp.concatenate([jnp.zeros((1, 3)), jax.vmap(between)(poses[:-1], poses[1:])])
 
@@ -48,7 +52,7 @@ def odometry(scans, wheels):
 def test_surfaces_are_the_walls_a_scan_sees():
     pose = jnp.array([3.0, 0.2, 0.4])
     (scan,) = [jax.tree.map(lambda x: x[0], scans_of(CORRIDOR, pose[None]))]
-    found = alignment.surfaces(scan, LIDAR)
+    found = jax.jit(alignment.surfaces, static_argnums=1)(scan, LIDAR)
     points = np.asarray(to_world(pose, found.points))[found.valid]
     normal = np.asarray(found.normal)[found.valid]
     across = np.array([np.sin(0.4), np.cos(0.4)])  # of the corridor, robot frame
@@ -147,13 +151,14 @@ def test_a_bare_corridor_says_nothing_of_the_way_along_it():
     true = motions_of(poses)
     wheels = true.at[1:].add(jnp.array([0.04, 0.03, 0.05]))
     found = odometry(scans_of(CORRIDOR, poses, 0.005), wheels)
-    along = jnp.array([np.cos(0.1), -np.sin(0.1), 0.0])  # frame of the robot
-    across = jnp.array([np.sin(0.1), np.cos(0.1), 0.0])
-    noise = jnp.diag(jnp.array([0.05, 0.05, 0.05]) ** 2)
+    true, wheels, fuse = np.asarray(true), np.asarray(wheels), jax.jit(alignment.fuse)
+    along = np.array([np.cos(0.1), -np.sin(0.1), 0.0])  # frame of the robot
+    across = np.array([np.sin(0.1), np.cos(0.1), 0.0])
+    noise = np.diag(np.array([0.05, 0.05, 0.05]) ** 2)
     for k in range(1, 6):
-        one = jax.tree.map(lambda x: x[k], found)  # noqa: B023
+        one = jax.tree.map(lambda x: np.asarray(x)[k], found)  # noqa: B023
         assert along @ one.information @ along < 0.01 * (across @ one.information @ across)
-        motion, cov = alignment.fuse(wheels[k], noise, one, jnp.asarray(0.3))
+        motion, cov = fuse(wheels[k], noise, one, jnp.asarray(0.3))
         off = motion - true[k]
         assert abs(off @ across) < 0.01 and abs(off[2]) < 0.01
         assert abs((motion - wheels[k]) @ along) < 0.01
@@ -216,13 +221,14 @@ def test_gradients_of_fused_motions_are_finite_and_right(rank):
     aligned = some_aligned(rank) if rank else some_aligned(1)
     aligned = aligned if rank else aligned._replace(information=jnp.zeros((3, 3)))
 
+    @jax.jit
     def value(scale, spread):
         noise = jnp.diag(spread * jnp.array([1.0, 0.5, 2.0]))
         motion, cov = alignment.fuse(wheels, noise, aligned, scale)
         return jnp.sum(motion**2) + jnp.sum(cov)
 
     given = jnp.asarray(0.7), jnp.asarray(1e-3)
-    slope = jax.grad(value, argnums=(0, 1))(*given)
+    slope = jax.jit(jax.grad(value, argnums=(0, 1)))(*given)
     for i in range(2):
         step = 1e-4 * given[i]
         up, down = (list(given) for _ in range(2))

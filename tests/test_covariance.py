@@ -1,5 +1,7 @@
 """A covariance that is put off, against the same operations on a dense matrix, one by one."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from jaxslam import covariance
 
 L, K = 6, 4
+OPERATIONS = "subtract", "subtract_seldom", "put_rows", "rows_at", "blocks_of", "settle"
 
 
 @pytest.fixture(autouse=True)
@@ -21,24 +24,31 @@ def start(rng):
     return root @ root.T + np.eye(2 * L)
 
 
+@pytest.fixture(scope="module")
+def jitted():
+    """The operations, compiled; `ROOM` is looked up when they are traced."""
+    one = {name: jax.jit(getattr(covariance, name)) for name in OPERATIONS}
+    return SimpleNamespace(**one, make_room=jax.jit(covariance.make_room, static_argnums=1))
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("put_off", [False, True])
-def test_it_is_the_dense_matrix(seed, put_off):
+def test_it_is_the_dense_matrix(seed, put_off, jitted):
     rng = np.random.default_rng(seed)
     dense = start(rng)
     cov = covariance.postpone(jnp.asarray(dense)) if put_off else jnp.asarray(dense)
     for _ in range(25):
-        cov = covariance.make_room(cov, K)
+        cov = jitted.make_room(cov, K)
         what = rng.integers(3)
         if what == 0:
             y = 0.1 * rng.normal(size=(K, 2 * L)) * (rng.random(K) < 0.6)[:, None]
             dense = dense - y.T @ y
-            cov = covariance.subtract(cov, jnp.asarray(y), jnp.bool_(False))
+            cov = jitted.subtract(cov, y, np.bool_(False))
         elif what == 1:
             wanted = rng.random() < 0.5
             y = 0.1 * rng.normal(size=(2, 2 * L)) * wanted
             dense = dense - y.T @ y
-            cov = covariance.subtract_seldom(cov, jnp.asarray(y), jnp.bool_(wanted))
+            cov = jitted.subtract_seldom(cov, y, np.bool_(wanted))
         else:
             at = np.where(rng.random(K) < 0.5, rng.permutation(2 * L)[:K], 2 * L).astype(np.int32)
             rows, inside = rng.normal(size=(K, 2 * L)), at < 2 * L
@@ -46,13 +56,13 @@ def test_it_is_the_dense_matrix(seed, put_off):
             rows[:, at[inside]] = (block + block.T)[:, inside]
             dense[at[inside]] = rows[inside]
             dense[:, at[inside]] = rows[inside].T
-            cov = covariance.put_rows(cov, jnp.asarray(rows), jnp.asarray(at))
-        slot = jnp.asarray(rng.integers(0, L, 3).astype(np.int32))
+            cov = jitted.put_rows(cov, rows, at)
+        slot = rng.integers(0, L, 3).astype(np.int32)
         blocks = dense.reshape(L, 2, L, 2)
         close = lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10)
-        close(covariance.rows_at(cov, slot), dense.reshape(L, 2, -1)[np.asarray(slot)])
-        close(covariance.blocks_of(cov), blocks[np.arange(L), :, np.arange(L)])
-        close(covariance.settle(cov), dense)
+        close(jitted.rows_at(cov, slot), dense.reshape(L, 2, -1)[slot])
+        close(jitted.blocks_of(cov), blocks[np.arange(L), :, np.arange(L)])
+        close(jitted.settle(cov), dense)
     assert isinstance(cov, covariance.Postponed) == put_off
 
 

@@ -15,6 +15,7 @@ SPEC = RunSpec()
 SMALL = Lidar(beams=61, first=-math.pi / 3, step=math.pi / 90, noise=0.01)
 SCANS, PRICE, STEEP = 24, SPEC.price, 10.0
 runs = jax.jit(edges.runs, static_argnums=(1, 2))
+cast = jax.jit(lidar.cast, static_argnums=2)
 
 
 def angles(scanner):
@@ -180,7 +181,7 @@ def test_a_straight_noisy_wall_is_one_run(noise, step):
     beams = int(100 / step) + 1
     scanner = Lidar(beams=beams, first=-math.radians(50), step=math.radians(step), noise=noise)
     walls = world.World(jnp.array([[2.0, -9.0, 2.0, 9.0]]))
-    clean = lidar.cast(walls, jnp.zeros(3), scanner)
+    clean = cast(walls, jnp.zeros(3), scanner)
     keys = jax.random.split(jax.random.key(0), 200)
     one = lambda key: edges.runs(lidar.disturb(key, clean, scanner), scanner, SPEC).valid.sum()
     count = np.asarray(jax.jit(jax.vmap(one))(keys))
@@ -215,7 +216,7 @@ def test_a_wall_that_steps_by_a_few_centimetres_is_one_run():
 def test_a_corner_is_put_at_its_beam(noise):
     scanner = Lidar(beams=181, first=-math.pi / 4, step=math.pi / 360, noise=0.01)
     walls = world.World(jnp.asarray(world.polyline([(3.0, -9.0), (3.0, 1.0), (-2.0, 1.0)])))
-    scan = lidar.cast(walls, jnp.zeros(3), scanner)
+    scan = cast(walls, jnp.zeros(3), scanner)
     if noise:
         scan = lidar.disturb(jax.random.key(1), scan, scanner)
     of = np.asarray(runs(scan, scanner, SPEC).of_beam)

@@ -17,8 +17,10 @@ ROOM = world.named("fig07")
 POSES = np.array([[1.0, 1.0, 0.3], [2.0, 1.5, 1.0], [3.0, 2.0, -0.5]])
 
 
-def scans_of(poses):
-    return jax.vmap(lidar.cast, in_axes=(None, 0, None))(ROOM, jnp.asarray(poses), LIDAR)
+@jax.jit
+@jax.vmap
+def scans_of(pose):
+    return lidar.cast(ROOM, pose, LIDAR)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +40,7 @@ def test_beams_end_in_occupied_cells_and_pass_free_ones(found):
             cells.append((found.occupied[tuple(at.T)], found.free[tuple(at.T)]))
     # Where beams graze a wall, more pass a cell than end in it.
     assert np.concatenate([one[0] for one in ended]).mean() > 0.94
-    assert np.concatenate([one[1] for one in passed]).mean() > 0.95
+    assert np.concatenate([one[1] for one in passed]).mean() > 0.99
     assert not (found.occupied & found.free).any()
     assert not (found.occupied | found.free)[[0, -1]].any()  # a margin of unknown cells
 

@@ -20,8 +20,8 @@ CONFIG = Config(lidar=LIDAR, landmarks=24, confirm=2)
 def drive():
     """Scans [T] of a robot that turns in a room, their times, and what `online.survey` tells."""
     poses = np.stack([np.full(6, 2.5), np.full(6, 2.0), 0.1 * np.arange(6)], axis=1)
-    cast = jax.vmap(lidar.cast, in_axes=(None, 0, None))
-    scans = cast(world.named("fig07"), jnp.asarray(poses), LIDAR)
+    cast = jax.jit(jax.vmap(lambda pose: lidar.cast(world.named("fig07"), pose, LIDAR)))
+    scans = jax.tree.map(np.asarray, cast(jnp.asarray(poses)))
     motions = np.array([[0.0, 0.0, 0.0]] + [[0.0, 0.0, 0.1]] * 5)
     told, start = [], jnp.asarray(poses[0])
     watch = lambda *now: told.append(now)

@@ -3,14 +3,14 @@
 Every log in the folder `--data`, and MIT's Killian Court where `.[data]` is installed, by one set
 of defaults. `NAME.reference.tum` and `NAME.relations` beside `NAME.clf` are what it is judged by.
 Odometry is that of the wheels, or of scans aligned to those before and fused with the wheels. Tuned
-noise is tuned on the other logs that have a reference, never on the one it is judged on. NEES is
-that of errors since the first scan. References are made by other programs: some centimetres of an
-error are theirs.
+noise is tuned on the other logs that have a reference, never on the one it is judged on. Errors are
+those of the smoothed way, which is what a run leaves, and of the filter's, which was known as the
+robot went; NEES is the filter's, of errors since the first scan. References are made by other
+programs: some centimetres of an error are theirs.
 """
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,7 +60,7 @@ class Seen(NamedTuple):
 
     config: Config
     log: Log  # with its motions aligned; the truth is the reference since the first scan
-    ms: dict[str, float]  # a scan, one core, from ranges to the topological map, by odometry
+    ms: dict[str, float]  # a scan, one core, from ranges to the smoothed map, by odometry
 
 
 def find(folder: Path | None) -> list[Known]:
@@ -95,7 +95,7 @@ def find(folder: Path | None) -> list[Known]:
 
 
 def look(known: Known) -> Seen:
-    """Features and aligned motions of a log, and what they and the filter cost on one core."""
+    """Features and aligned motions of a log, and what mapping it costs on one core."""
     recording = known.recording
     config = logs.config_of_scans([recording])._replace(landmarks=online.MOST)
     motion = logs.motions(recording.odometry)
@@ -105,15 +105,17 @@ def look(known: Known) -> Seen:
         i, j = match_times(recording.times, known.reference[0]).T
         truth[i] = seen_from(known.reference[1][j[0]], known.reference[1][j])
         judged[i] = True
-    calls: dict[str, tuple] = {}
-    for odometry in ODOMETRY:
-        noise, how = log_noise(aligned=odometry == "scan"), {"aligned": odometry == "scan"}
-        whole = partial(online.survey, config, noise, jnp.zeros(3), motion, scans, **how)
-        calls[odometry] = (whole,)
+    found = {}
+
+    def survey(odometry: str) -> None:
+        by_scans = odometry == "scan"
+        given = config, log_noise(aligned=by_scans), jnp.zeros(3), motion, scans
+        found[odometry] = online.survey(*given, aligned=by_scans, smooth=True)
+
     one_core.pin()
-    taken = one_core.least(calls, repeats=1)
+    taken = one_core.least({name: (survey, name) for name in ODOMETRY}, repeats=1)
     one_core.unpin()
-    found = calls["scan"][0]()
+    found = found["scan"]
     config = config._replace(landmarks=found.belief.seen.size)  # as many as it grew to
     log = Log(truth, motion, found.nodes, None, judged, aligned=found.aligned)
     return Seen(config, logs.real(log), {name: 1e3 * s / len(motion) for name, s in taken.items()})
@@ -148,19 +150,21 @@ def row(
     log = given(seen.log, odometry, landmarks)
     start = slam.init(seen.config, jnp.zeros(3))
     belief, info = slam.run(seen.config, noise, start, monte_carlo.inputs_of(log))
-    poses = np.asarray(info.pose, np.float64)
-    numbers: common.Numbers = dict.fromkeys(("ate_rmse_m", "relations_translation_m", "nees"))
+    inputs, info = jax.tree.map(np.asarray, (monte_carlo.inputs_of(log), info))
+    filtered = np.asarray(info.pose, np.float64)
+    poses, _ = online.smoothed(seen.config, noise, jnp.zeros(3), inputs, info, belief)
+    numbers: common.Numbers = {"nees": None}
     numbers["landmarks_confirmed"] = int(np.sum(slam.confirmed(seen.config, belief)))
     numbers["ms_per_scan"] = seen.ms[odometry]
+    for prefix, way in (("", poses), ("filter_", filtered)):
+        told = report.judged(known.recording, way, known.reference, known.relations)
+        pairs = told.get("relations", {})
+        numbers[f"{prefix}ate_rmse_m"] = told.get("ate_rmse_m")
+        numbers[f"{prefix}relations_translation_m"] = pairs.get("translation_mean_m")
+        numbers[f"{prefix}relations_rotation_deg"] = pairs.get("rotation_mean_deg")
     if known.reference is not None:
-        told = report.against_reference(known.recording.times, poses, known.reference)
-        error = np.where(log.judged[:, None], report.error_of(poses, log.truth), np.nan)
-        numbers["ate_rmse_m"] = told["ate_rmse_m"]
-        numbers["nees"] = report.nees_of(error, np.asarray(info.pose_cov))
-    if known.relations is not None:
-        told = report.against_relations(known.recording, poses, known.relations)["relations"]
-        numbers["relations_translation_m"] = told["translation_mean_m"]
-        numbers["relations_rotation_deg"] = told["rotation_mean_deg"]
+        error = np.where(log.judged[:, None], report.error_of(filtered, log.truth), np.nan)
+        numbers["nees"] = report.nees_of(error, info.pose_cov)
     return numbers, poses[:, :2]
 
 
@@ -203,8 +207,13 @@ def compute(folder: Path | None, tune: bool, kept: common.Kept) -> common.Number
 def line(row: common.Numbers) -> str:
     """A row as text."""
     text = f"{row['log']:14} {row['odometry']:7} {row['landmarks']:14} {row['noise']:8}"
-    units = {"ate_rmse_m": "m ATE", "relations_translation_m": "m relations", "nees": "NEES"}
-    told = [f"{row[key]:8.3f} {unit}" for key, unit in units.items() if row[key] is not None]
+    names = {"ate_rmse_m": "m ATE", "relations_translation_m": "m relations"}
+    told = [
+        f"{row[key]:8.3f} {name} (filter {row[f'filter_{key}']:.3f})"
+        for key, name in names.items()
+        if row[key] is not None
+    ]
+    told += [] if row["nees"] is None else [f"{row['nees']:8.3f} NEES"]
     return f"{text}{'  '.join(told)}  {row['ms_per_scan']:.1f} ms"
 
 

@@ -2,15 +2,14 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from scipy.special import chdtri
 
-from jaxslam.geometry import to_world
 from jaxslam.linalg import add_products, inverse_root
 from jaxslam.nodes import Nodes
+from jaxslam.poses import placed
 from jaxslam.types import WALL, Array, expect
 
 
@@ -142,7 +141,7 @@ def landmarks(
     # Directions of undirected lines are averaged as vectors at twice the angle.
     turned = np.asarray(nodes.direction) + np.asarray(poses)[:, 2:]
     lines = np.stack([np.cos(2 * turned[kept]), np.sin(2 * turned[kept])], axis=-1)
-    points = np.asarray(jax.vmap(to_world)(poses, nodes.xy))[kept]
+    points = placed(np.asarray(poses)[:, None], np.asarray(nodes.xy))[kept]
     total = np.zeros((size, 2), points.dtype)
     np.add.at(total, which[kept], np.where(is_wall[kept][:, None], lines, points))
     places = total / np.maximum(np.bincount(which[kept], minlength=size), 1)[:, None]

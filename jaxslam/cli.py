@@ -108,7 +108,7 @@ def simulate(
             config,
             survey,
             lines,
-            report.error_of(report.poses_of(survey), truth),
+            report.error_of(survey.poses, truth),
             world=known,
         )
     report.tell(numbers, f"{runs} runs of {steps} scans, world {world}", out)
@@ -119,6 +119,7 @@ def run(
     reference: Path | None = None,
     relations: Path | None = None,
     odometry: Literal["scan", "wheels"] = "scan",
+    smooth: bool = True,
     noise: Path | None = None,
     scan_topic: str | None = None,
     odometry_topic: str | None = None,
@@ -140,6 +141,8 @@ def run(
         reference: Trajectory to compare with, a TUM file on the log's clock.
         relations: Verified relative poses to compare with, on the log's clock.
         odometry: Scans aligned to those before and fused with the wheels, or the wheels alone.
+        smooth: At the end, tell all poses and places by all that was seen; else each pose stays as
+            the filter told it when it was there.
         noise: File of the noise that the filter assumes; by default a cautious one.
         scan_topic: Topic of the laser scans in a bag; by default that with most messages.
         odometry_topic: Topic of the odometry in a bag, or of the transforms; likewise.
@@ -175,8 +178,9 @@ def run(
             if view is not None:
                 file = place / "run.rrd" if view == "file" else None
                 shown = View(config, recording.times, scans, file)
-            survey = _map(config, assumed, motions, scans, aligned=by_scans, view=shown)
-            poses = report.poses_of(survey)
+            how = {"aligned": by_scans, "smooth": smooth}
+            survey = _map(config, assumed, motions, scans, view=shown, **how)
+            poses = survey.poses
         numbers = {
             "scans": len(poses),
             "skipped_lines": recording.skipped,
@@ -188,13 +192,16 @@ def run(
             "seconds": seconds,
         }
         lines, error = {"odometry": wheels}, None
+        filtered = np.asarray(survey.info.pose, np.float64)
         if known is not None:
-            numbers |= report.against_reference(recording.times, poses, known)
-            lines["reference"], error = report.beside(recording.times, poses, known)
+            lines["reference"] = report.beside(recording.times, poses, known)
+            error = report.since_start(recording.times, filtered, known)
             numbers["nees"] = report.nees_of(error, np.asarray(survey.info.pose_cov))
-        if verified is not None:
-            numbers |= report.against_relations(recording, poses, verified)
-        numbers |= {"dead_reckoning": blind} if blind else {}
+        if blind:
+            numbers |= report.judged(recording, poses, known, verified)
+            own = report.judged(recording, filtered, known, verified)
+            numbers |= {"filter": own} if smooth else {}
+            numbers["dead_reckoning"] = blind
         report.write(place, numbers, recording.times, survey)
         told = jnp.asarray(motions, float)
         inputs = slam.Inputs(told, survey.nodes, aligned=survey.aligned)
@@ -214,8 +221,8 @@ def _map(
     motions: np.ndarray,
     scans: Scan,
     *,
-    aligned: bool,
     view: View | None,
+    **how: bool,
 ) -> Survey:
     """`online.survey` of a log, which shows how far it is."""
     with tqdm(total=len(motions), unit="scan", desc="compiling", mininterval=0.2) as bar:
@@ -229,7 +236,7 @@ def _map(
                 view.watch(mapper, part)
 
         given = config, noise, jnp.zeros(3), motions, scans
-        survey = online.survey(*given, aligned=aligned, watch=watch)
+        survey = online.survey(*given, watch=watch, **how)
     if view is not None:
         view.end(survey.graph)
     return survey

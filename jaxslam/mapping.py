@@ -109,7 +109,7 @@ def pose_graph(config: Config, noise: Noise, survey: Survey, inputs: Inputs) -> 
     ray = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     from_polar = np.stack([ray, turn], axis=-1)
     return PoseGraph(
-        poses=np.asarray(info.pose, np.float64),
+        poses=survey.poses,
         places=np.asarray(belief.places, np.float64)[np.asarray(kept)],
         motion=np.asarray(motion, np.float64)[1:],
         motion_information=np.linalg.inv(q[1:]),

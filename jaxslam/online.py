@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import alignment, slam, topomap
+from jaxslam import alignment, association, slam, smoother, sparse, topomap
 from jaxslam.alignment import Aligned, LocalMap
 from jaxslam.batches import pad
 from jaxslam.belief import Belief, grown
@@ -31,6 +31,7 @@ from jaxslam.types import Array
 STRETCH = 64  # scans
 ROOM = 384  # slots by which the map of the filter grows
 SPARE = 128  # free ones at the beginning of a stretch, at least
+LIKE = 512  # scans, or landmarks: runs are smoothed as if they had a multiple of them
 MOST = 2048  # slots, unless told otherwise: what a building of some kilometres of corridor has
 
 
@@ -51,10 +52,11 @@ class Part(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """A drive, filtered, with its topological map."""
+    """A drive, mapped, with its topological map."""
 
-    belief: Belief  # at the end
-    info: Info  # [T]
+    poses: np.ndarray  # (T, 3) float64, world frame, as they are known at the end
+    belief: Belief  # at the end; if smoothed, its places are, with the filter's covariance
+    info: Info  # [T] of the filter: what was known by then
     nodes: Nodes  # [T]
     graph: Graph
     aligned: Aligned | None = None  # [T] motions by scans, where they were aligned
@@ -113,9 +115,13 @@ def survey(
     scans: Scan,
     *,
     aligned: bool = False,
+    smooth: bool = False,
     watch: Callable[[Mapper, Part], Any] | None = None,
 ) -> Survey:
     """Map a whole drive.
+
+    The filter tells each pose by what was seen up to it. If it is to be smoothed, all poses and
+    places are told by all that was seen (`sparse.smooth`).
 
     Args:
         config: Of front end and filter; `landmarks` is how many the map may come to hold.
@@ -124,6 +130,7 @@ def survey(
         motions: (T, 3) odometry since the scan before, zero at the first.
         scans: [T].
         aligned: Whether scans are to be aligned and fused with the wheels.
+        smooth: Whether the drive is to be smoothed at the end.
         watch: Called after each stretch with what is known by then, and what the stretch gave.
     """
     # Slices of JAX's own arrays would each be compiled.
@@ -144,13 +151,55 @@ def survey(
         if watch is not None:
             watch(mapper, part)
     whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return Survey(
-        mapper.belief,
-        whole.info,
-        whole.nodes,
-        graph(config, mapper, whole.info.pose),
-        whole.aligned,
+    info, poses = whole.info, np.asarray(whole.info.pose, np.float64)
+    if smooth:
+        inputs = Inputs(motions.astype(info.pose.dtype), whole.nodes, aligned=whole.aligned)
+        poses, belief = smoothed(config, noise, start, inputs, info, mapper.belief)
+        mapper = mapper._replace(belief=belief)
+    told = graph(config, mapper, poses)
+    return Survey(poses, mapper.belief, info, whole.nodes, told, whole.aligned)
+
+
+_records = jax.jit(smoother.records, static_argnames="doubt")
+
+
+def smoothed(
+    config: Config, noise: Noise, start: Array, inputs: Inputs, info: Info, belief: Belief
+) -> tuple[np.ndarray, Belief]:
+    """A filtered drive by all that was seen on it.
+
+    Args:
+        config: Of the filter.
+        noise: What it assumed.
+        start: (3,) its first pose.
+        inputs: [T] it was given, NumPy.
+        info: [T] what it found, NumPy.
+        belief: At the end.
+
+    Returns:
+        Poses (T, 3) float64, and the belief with the last of them and the places that go with
+        them; covariances are still the filter's.
+    """
+    steps, room = len(info.pose), lambda count: (count // LIKE + 1) * LIKE
+    found = association.landmarks(
+        info.id, info.pose, inputs.nodes, size=room(np.count_nonzero(np.unique(info.id) >= 0))
     )
+    # The rest stands still and sees nothing.
+    inputs, which, guess = pad((inputs, np.asarray(found.which), info.pose), to=room(steps))
+    which[steps:] = -1
+    for motion in jax.tree.leaves((inputs.motion, inputs.aligned and inputs.aligned.motion)):
+        motion[steps:] = 0.0
+    records = _records(noise, start, inputs, which, doubt=config.doubt)
+    track = sparse.smooth(records, guess, found.places)
+    # The names are in order, and no landmark has the name that fills up the end.
+    names = np.asarray(found.id)
+    names = np.where(names < 0, np.iinfo(names.dtype).max, names)
+    at = np.searchsorted(names, belief.id)
+    same = (np.asarray(belief.seen) > 0) & (names[at] == np.asarray(belief.id))
+    places = np.where(same[:, None], track.places[at], belief.places)
+    poses = track.poses[:steps]
+    mean = np.concatenate([poses[-1], places.ravel()])
+    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype))
 
 
 def graph(config: Config, mapper: Mapper, poses: np.ndarray) -> Graph:

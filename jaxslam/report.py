@@ -36,11 +36,6 @@ Trajectory = tuple[np.ndarray, np.ndarray]
 """Times (N,) [s] and poses (N, 3)."""
 
 
-def poses_of(survey: Survey) -> np.ndarray:
-    """Estimated poses (T, 3) float64."""
-    return np.asarray(survey.info.pose, np.float64)
-
-
 def error_of(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Errors (..., 3) [m, m, rad] of poses (..., 3), world frame."""
     return np.asarray(metrics.pose_error(jnp.asarray(poses, float), jnp.asarray(truth, float)))
@@ -89,28 +84,37 @@ def against_relations(recording: Recording, poses: np.ndarray, verified: Relatio
     return {"relations": metrics.relations_error(recording.times, poses, *wheels, verified)}
 
 
-def beside(
-    times: np.ndarray, poses: np.ndarray, known: Trajectory
-) -> tuple[np.ndarray, np.ndarray]:
-    """A reference, aligned with poses (T, 3), and their error since the start.
+def judged(
+    recording: Recording,
+    poses: np.ndarray,
+    known: Trajectory | None,
+    verified: Relations | None,
+) -> Numbers:
+    """Errors of poses (T, 3) against all that is known of a recording's way."""
+    numbers = {} if known is None else against_reference(recording.times, poses, known)
+    return numbers | ({} if verified is None else against_relations(recording, poses, verified))
 
-    Returns:
-        The reference (K, 3) in the frame of the map, aligned as a whole, and the errors (T, 3)
-        to the reference laid on the first pose they share, NaN where it has none.
-    """
+
+def beside(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> np.ndarray:
+    """A reference (K, 3) in the frame of the map, aligned as a whole with poses (T, 3)."""
     i, j = metrics.match_times(times, known[0]).T
-    frame = metrics.align(poses[i, :2], known[1][j, :2])
+    return seen_from(metrics.align(poses[i, :2], known[1][j, :2]), known[1][j])
+
+
+def since_start(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> np.ndarray:
+    """Errors (T, 3) of poses to a reference laid on the first they share; NaN where it has none."""
+    i, j = metrics.match_times(times, known[0]).T
     zero = np.zeros(3)
     first = seen_from(seen_from(known[1][j[0]], zero), seen_from(poses[i[0]], zero))
     error = np.full(poses.shape, np.nan)
     error[i] = error_of(poses[i], seen_from(first, known[1][j]))
-    return seen_from(frame, known[1][j]), error
+    return error
 
 
 def write(place: Path, numbers: Numbers, times: np.ndarray, survey: Survey) -> None:
     """Write the files of numbers that every command has."""
     write_json(place / "metrics.json", numbers)
-    tum.write(place / "trajectory.tum", times, poses_of(survey))
+    tum.write(place / "trajectory.tum", times, survey.poses)
     write_map(place / "map.geojson", survey.graph)
 
 
@@ -118,7 +122,7 @@ def write_maps(
     place: Path, config: Config, noise: Noise, survey: Survey, inputs: Inputs, scans: Scan
 ) -> None:
     """Write map.yaml, map.pgm, graph.g2o and, where networkx is there, map.graphml."""
-    grid = mapping.occupancy(poses_of(survey), scans, config.lidar, resolution=CELL)
+    grid = mapping.occupancy(survey.poses, scans, config.lidar, resolution=CELL)
     occupancy.write(place / "map.yaml", grid)
     posegraph.write(place / "graph.g2o", mapping.pose_graph(config, noise, survey, inputs))
     if find_spec("networkx") is not None:
@@ -181,7 +185,7 @@ def draw(
     """
     from jaxslam import plot  # matplotlib takes its time to load
 
-    poses = poses_of(survey)
+    poses = survey.poses
     walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
     inside = [line for what, line in lines.items() if scans is None or what != "odometry"]
     shown = [poses, survey.graph.xy, *inside, *walls]  # wheels may lead far off the map

@@ -58,7 +58,13 @@ class Track(NamedTuple):
 
 
 def records(
-    noise: Noise, start: Array, inputs: Inputs, which: Array, *, prior: Prior | None = None
+    noise: Noise,
+    start: Array,
+    inputs: Inputs,
+    which: Array,
+    *,
+    prior: Prior | None = None,
+    doubt: float = 1.0,
 ) -> Records:
     """What the filter was given, as the smoother takes it.
 
@@ -68,6 +74,7 @@ def records(
         inputs: [T] of the filter; `known` is not read.
         which: (T, M) int32 landmark 0..L-1 of each feature; L, or -1, for none.
         prior: Of the landmarks.
+        doubt: Factor on the standard deviation of features that are not trusted, as `Config.doubt`.
 
     Raises:
         ValueError: `which` has another shape or type than the features; while tracing.
@@ -80,14 +87,15 @@ def records(
         motion=motion,
         q=q + (FLOOR**2 * jnp.eye(3, dtype=q.dtype))[None],
         seen=jax.vmap(sensor.observation)(nodes),
-        r=jax.vmap(sensor_noise, in_axes=(None, 0))(noise, nodes),
+        r=jax.vmap(partial(sensor_noise, noise, doubt=doubt))(nodes),
         kind=nodes.kind,
         which=jnp.where(nodes.valid, which, -1),
         prior=prior,
     )
 
 
-def _check(records: Records, poses: Array, places: Array) -> None:
+def check(records: Records, poses: Array, places: Array) -> None:
+    """Raise ValueError if shapes or types do not fit."""
     expect("poses", poses, ("T", 3), jnp.floating)
     expect("places", places, ("L", 2), jnp.floating)
     expect("records.which", records.which, (len(poses), "M"), jnp.int32)
@@ -107,7 +115,7 @@ def _root(cov: Array) -> Array:
     return inverse_root(cov)[0]
 
 
-def _prepared(records: Records, size: int) -> Records:
+def prepared(records: Records, size: int) -> Records:
     """Records with a prior, and with roots W of `_root` instead of `r`.
 
     They are zero where a feature has no landmark or holds nonsense.
@@ -150,24 +158,24 @@ def _residuals(records: Records, state: State) -> tuple[State, Rows]:
     return (times(root, motion), times(records.r, seen)), rows
 
 
-def _line(records: Records, places: Array) -> Array:
+def with_lines(records: Records, places: Array) -> Array:
     """Wrap the directions of walls that are seen, among `places` (L, 2)."""
     wall = jnp.any(records.r != 0.0, axis=(-2, -1)) & (records.kind == WALL)
     wall = jnp.zeros(places.shape[0], bool).at[records.which].max(wall)
     return places.at[:, 0].set(jnp.where(wall, wrap_line(places[:, 0]), places[:, 0]))
 
 
-def _cost(records: Records, state: State) -> tuple[Array, State, Rows, Array]:
+def evaluate(records: Records, state: State) -> tuple[Array, State, Rows, Array]:
     """Squared Mahalanobis norm () of all residuals, these, their rows, and the prior's pull."""
     residuals, rows = _residuals(records, state)
-    off = _line(records, state[1] - records.prior.places)
+    off = with_lines(records, state[1] - records.prior.places)
     pull = times(records.prior.information, off)  # (L, 2) half the gradient of the prior's part
     return sum(jnp.sum(x**2) for x in residuals) + jnp.sum(off * pull), residuals, rows, pull
 
 
 def _step(records: Records, state: State) -> tuple[Array, State]:
     """Cost () of a state, and the Gauss-Newton step from it."""
-    cost, residuals, rows, pull = _cost(records, state)
+    cost, residuals, rows, pull = evaluate(records, state)
     extra, size = records.prior.information, state[1].shape[0]
     poses, places = arrow.gradient(rows, residuals, size)
     # Places of which nothing is known stay; the others are held by no more than rounding takes.
@@ -186,7 +194,7 @@ def _allowed(records: Records, state: State, step: State, cost: Array) -> Array:
     most = cost * (1 + 8 * jnp.finfo(cost.dtype).eps)
 
     def halve(now: tuple[Array, Array]) -> tuple[Array, Array]:
-        return now[0] / 2, _cost(records, _moved(state, step, now[0] / 2))[0] <= most
+        return now[0] / 2, evaluate(records, _moved(state, step, now[0] / 2))[0] <= most
 
     first = jnp.full((), 2.0, cost.dtype), jnp.zeros((), bool)
     more = lambda now: ~now[1] & (now[0] > 0.5**HALVINGS)
@@ -219,8 +227,8 @@ def smooth(records: Records, poses: Array, places: Array, *, iterations: int = 1
     Raises:
         ValueError: An argument has another shape or type; while tracing.
     """
-    _check(records, poses, places)
-    records = _prepared(records, places.shape[0])
+    check(records, poses, places)
+    records = prepared(records, places.shape[0])
 
     def body(state: State, _: None) -> tuple[State, Array]:
         cost, step = _step(records, state)
@@ -232,6 +240,6 @@ def smooth(records: Records, poses: Array, places: Array, *, iterations: int = 1
     poses, places = state
     return Track(
         poses=poses.at[:, 2].set(wrap_angle(poses[:, 2])),
-        places=_line(records, places),
-        cost=jnp.append(costs, _cost(records, state)[0]),
+        places=with_lines(records, places),
+        cost=jnp.append(costs, evaluate(records, state)[0]),
     )

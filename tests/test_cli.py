@@ -201,6 +201,8 @@ def test_run_beats_its_odometry(done):
         numbers["relations"].keys() & blind["relations"].keys()
     )
     assert numbers["heading_rmse_deg"] < blind["heading_rmse_deg"]
+    assert numbers["filter"].keys() == blind.keys()
+    assert numbers["filter"]["ate_rmse_m"] != numbers["ate_rmse_m"]  # it was smoothed
 
 
 def test_run_starts_at_the_origin_on_the_clock_of_the_log(done):

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import alignment, lidar, online, slam, topomap, world
+from jaxslam import alignment, association, lidar, online, slam, smoother, sparse, topomap, world
 from jaxslam.alignment import AlignSpec
 from jaxslam.geometry import unit
 from jaxslam.lidar import Lidar
@@ -97,6 +97,31 @@ def test_stretches_give_what_one_log_with_all_room_gives(drive, surveys, aligned
     mapper = heard[-1][0]
     close(mapper.arcs, jax.tree.map(lambda x: x[: 2 * size], arcs))
     assert not arcs.seen[2 * size :].any() and len(found.graph.id) > 4
+
+
+def test_a_smoothed_drive_is_that_of_the_smoother(drive, surveys, monkeypatch):
+    monkeypatch.setattr(online, "ROOM", CONFIG.landmarks)
+    monkeypatch.setattr(online, "LIKE", 8)
+    motions, scans = drive
+    plain = surveys[False][0]
+    found = online.survey(CONFIG, NOISE, START, motions, scans, smooth=True)
+    close(found.info, plain.info)
+    np.testing.assert_array_equal(plain.poses, plain.info.pose)
+    marks = association.landmarks(plain.info.id, plain.info.pose, plain.nodes)
+    inputs = Inputs(jnp.asarray(motions), jax.tree.map(jnp.asarray, plain.nodes))
+    told = smoother.records(NOISE, START, inputs, marks.which, doubt=CONFIG.doubt)
+    track = sparse.smooth(told, plain.info.pose, marks.places)
+    assert np.abs(track.poses - plain.poses).max() > 1e-3  # there was something to do
+    np.testing.assert_allclose(found.poses, track.poses, atol=1e-8)
+    np.testing.assert_allclose(found.belief.pose, track.poses[-1], atol=1e-8)
+    place = dict(zip(np.asarray(marks.id).tolist(), track.places, strict=True))
+    moved = 0
+    for slot in np.flatnonzero(found.belief.seen):
+        own = plain.belief.places[slot]  # where it was not seen twice
+        want = place.get(int(found.belief.id[slot]), own)
+        np.testing.assert_allclose(found.belief.places[slot], want, atol=1e-8)
+        moved += np.abs(want - own).max() > 1e-4
+    assert moved > 4
 
 
 def test_a_stretch_is_told_when_it_is_done(surveys):

@@ -51,11 +51,13 @@ def test_a_picture_is_drawn_of_logs_with_and_without_reference(tmp_path):
             for k, landmarks in enumerate(real_logs.LANDMARKS):
                 row = {"ate_rmse_m": None, "relations_translation_m": None, "nees": None}
                 row |= {"log": log, "odometry": odometry, "landmarks": landmarks}
-                rows.append(row | {"noise": "default", "ms_per_scan": 5.0, known: 1.0 + k})
+                row |= {"noise": "default", "ms_per_scan": 5.0, known: 1.0 + k}
+                rows.append(row | {f"filter_{known}": 2.0 + k})
     ways["hall"]["reference"] = ways["hall"]["estimate"]
     real_logs.draw({"rows": rows, "ways": ways}, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    assert "1.000 m ATE" in real_logs.line(rows[0]) and "relations" in real_logs.line(rows[-1])
+    assert "1.000 m ATE (filter 2.000)" in real_logs.line(rows[0])
+    assert "relations" in real_logs.line(rows[-1])
 
 
 def test_a_folder_that_is_none_is_told(tmp_path, capsys):

@@ -80,6 +80,7 @@ class _Pairs(NamedTuple):
 
 NEIGHBOURS = 3  # on either side, whose line gives the normal
 JOINED = (0.06, 0.1)  # [m], and part of the range: neighbours further apart are on two surfaces
+NOWHERE = 1e6  # [m] where points are put that are no partners
 FLAT = 0.04  # most variance across a surface, as part of that along it
 
 
@@ -134,26 +135,27 @@ def _partners(
 ) -> _Pairs:
     """Partners of points (N, 2), frame of the map, within a distance: the nearest in each scan."""
     middle = lidar.first + lidar.step * (lidar.beams - 1) / 2
+    # Column by column, as pairs of numbers are gathered slowly.
+    columns = jnp.where(local.surfaces.valid[..., None], local.surfaces.points, NOWHERE)
+    columns = columns.swapaxes(1, 2)
 
-    def of(surface: Surfaces, pose: Array) -> tuple[Array, Array, Array]:
-        away = points - pose[None, :2]
-        bearing = wrap_angle(jnp.arctan2(away[:, 1], away[:, 0]) - pose[2] - middle)
+    def of(surface: Surfaces, column: Array, pose: Array) -> tuple[Array, Array, Array]:
+        (x, y), (u, v) = points.T, column
+        bearing = wrap_angle(jnp.arctan2(y - pose[1], x - pose[0]) - pose[2] - middle)
         own = jnp.round(bearing / lidar.step + (lidar.beams - 1) / 2).astype(jnp.int32)
         best, at = jnp.full(hit.shape, jnp.inf, points.dtype), jnp.zeros_like(own)
         for k in range(-spec.reach, spec.reach + 1):
             beam = jnp.clip(own + k, 0, lidar.beams - 1)
-            off = points - surface.points[beam]
-            square = jnp.where(surface.valid[beam], dot(off, off), jnp.inf)
+            square = (x - u[beam]) ** 2 + (y - v[beam]) ** 2
             at, best = jnp.where(square < best, beam, at), jnp.minimum(square, best)
         normal = surface.normal[at]
         offset = dot(normal, surface.points[at])
         across = dot(normal, points) - offset
-        found = jnp.isfinite(best)
-        along = jnp.where(found, best, 0.0) - across**2
         limit = jnp.maximum(far, surface.gap[at])
-        return normal, offset, found & hit & (jnp.abs(across) < far) & (along < limit**2)
+        near = (jnp.abs(across) < far) & (best - across**2 < limit**2)
+        return normal, offset, surface.valid[at] & hit & near
 
-    normal, offset, found = jax.vmap(of)(local.surfaces, local.poses)
+    normal, offset, found = jax.vmap(of)(local.surfaces, columns, local.poses)
     found = found.astype(points.dtype)
     return _Pairs(normal, offset, found / jnp.maximum(found.sum(axis=0), 1.0)[None])
 

@@ -230,14 +230,15 @@ def _nodes(
 
 def _seen_ways(arcs: Arcs, index: dict[int, int], xy: np.ndarray) -> list[Way]:
     """Arcs and frontiers, laid between nodes (N, 2) of the graph by the index of an id."""
-    ends, seen = np.asarray(arcs.ends), np.asarray(arcs.seen)
+    arcs = Arcs(*map(np.asarray, arcs))  # of JAX's own, each number would be a program
+    ends, seen = arcs.ends, arcs.seen
     slots = [
         k
         for k in np.flatnonzero(seen > 0)
         if ends[k, 0] in index and (ends[k, 1] in index or ends[k, 1] < 0)
     ]
     pairs = np.array([[index.get(int(i), -1) for i in ends[k]] for k in slots], int).reshape(-1, 2)
-    whole = np.asarray(arcs.line, float)
+    whole = arcs.line.astype(float)
     first, last = whole[:, 0].copy(), whole[:, -1].copy()
     first[slots] = xy[pairs[:, 0]]
     last[slots] += np.where(pairs[:, 1:] < 0, first[slots] - whole[slots, 0], 0.0)

@@ -211,32 +211,34 @@ def add_driven(
         clearance: (N,) [m] of the nodes.
         apart: Distance [m] between the way out and the way back around something, at least.
     """
-    known = list(known)
+    known, most = list(known), len(known) + len(driven)
+    pairs, lengths, extents = np.zeros((most, 2), int), np.zeros(most), np.zeros((most, 4))
     bounds = lambda line: np.concatenate([line.min(axis=0), -line.max(axis=0)])
-    extents = [bounds(way.line) for way in known]
+
+    def note(k: int, way: Way) -> None:
+        pairs[k], lengths[k], extents[k] = (way.a, way.b), way.length, bounds(way.line)
 
     def learn(way: Way) -> None:
+        note(len(known), way)
         known.append(way)
-        extents.append(bounds(way.line))
 
+    for k, way in enumerate(known):
+        note(k, way)
     for way in driven:
-        room = max(BESIDE, clearance[way.a], clearance[way.b])
+        count, room = len(known), max(BESIDE, clearance[way.a], clearance[way.b])
         if way.a == way.b:
             around = np.linalg.norm(way.line - way.line[::-1], axis=1).max() > 2 * apart
             others = [w.line for w in known if w.a == w.b == way.a]
             if around and all(beside(way.line, line)[0].max() > room for line in others):
                 learn(way)
             continue
-        pairs = np.array([[w.a, w.b] for w in known], int).reshape(-1, 2)
-        lengths = np.array([w.length for w in known])
         # An arc that the drive did not keep beside is none that it followed.
-        close = np.all(np.reshape(extents, (-1, 4)) >= bounds(way.line) - room, axis=1)
+        close = np.all(extents[:count] >= bounds(way.line) - room, axis=1)
         for k in np.flatnonzero(close):
             close[k] = beside(known[k].line, way.line)[0].max() < room
+        usable = np.where(close, lengths[:count], np.inf)
         try:
-            arcs = shortest(
-                pairs, np.where(close, lengths, np.inf), way.a, way.b, places=len(clearance)
-            )
+            arcs = shortest(pairs[:count], usable, way.a, way.b, places=len(clearance))
         except ValueError:
             arcs = None
         if arcs is None or lengths[arcs].sum() > DETOUR[0] * way.length + DETOUR[1]:

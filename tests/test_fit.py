@@ -17,6 +17,14 @@ P = len(fit.names(TRUTH))
 OFF = fit.constrain(jax.tree.map(lambda x: x + 0.7, fit.unconstrain(TRUTH)))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_device():
+    """Each device compiles its own program; `test_batches` tells that they give the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "devices", lambda real=jax.devices: real()[:1])
+        yield
+
+
 def part(logs, chosen):
     return jax.tree.map(lambda x: x[chosen], logs)
 

@@ -238,7 +238,7 @@ def _map(
         given = config, noise, jnp.zeros(3), motions, scans
         survey = online.survey(*given, watch=watch, **how)
     if view is not None:
-        view.end(survey.graph)
+        view.end(survey)
     return survey
 
 

@@ -67,7 +67,10 @@ def _assembled(parts: list[Blocks], shape: tuple[int, int]) -> sparse.csc_array:
 
 
 def _matrix(rows: Rows, extra: np.ndarray) -> sparse.csc_array:
-    """J^T J, and what is known of landmarks (L, 2, 2); 1 on the diagonal where it is nothing."""
+    """J^T J, and what is known of landmarks (L, 2, 2).
+
+    Places of which nothing is known stay; all else is held by no more than rounding takes.
+    """
     steps, size = len(rows.at), 3 * len(rows.at) + 2 * len(extra)
     pose, place = 3 * np.arange(steps), 3 * steps + 2 * np.arange(len(extra))
     t, m = np.nonzero(np.any(rows.by_place != 0.0, axis=(2, 3)))
@@ -80,8 +83,9 @@ def _matrix(rows: Rows, extra: np.ndarray) -> sparse.csc_array:
     ]
     jacobian = _assembled(parts, (3 * steps + 2 * len(t), size))
     matrix = jacobian.T @ jacobian + _assembled([(place, place, extra)], (size, size))
-    nothing = np.where(matrix.diagonal() > 0.0, 0.0, 1.0)
-    return (matrix + sparse.diags_array(nothing)).tocsc()
+    known = matrix.diagonal()
+    held = np.where(known > 0.0, 4 * np.finfo(float).eps * known, 1.0)
+    return (matrix + sparse.diags_array(held)).tocsc()
 
 
 def smooth(

@@ -3,6 +3,7 @@
 The only part of the library that imports rerun.
 """
 
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,13 @@ import jax
 import numpy as np
 
 from jaxslam import lidar, slam
+from jaxslam.belief import Belief
 from jaxslam.covariance import blocks_of
 from jaxslam.io.errors import InputError
 from jaxslam.lidar import Scan
-from jaxslam.online import Mapper, Part
+from jaxslam.online import Mapper, Part, Survey
 from jaxslam.poses import placed
 from jaxslam.slam import Config
-from jaxslam.topomap import Graph
 
 
 class View:
@@ -53,7 +54,7 @@ class View:
 
     def watch(self, mapper: Mapper, part: Part) -> None:
         """Show the scans of a stretch where they were made, and the landmarks after them."""
-        from rerun import Arrows3D, LineStrips3D, Points3D
+        from rerun import Arrows3D, Points3D
 
         from jaxslam.plot.sheet import BLUE, ORANGE
 
@@ -71,28 +72,30 @@ class View:
             )
             seen = _flat(placed(pose, self._ends[at][self._hit[at]]))
             self._log("scan", Points3D(seen, colors=_rgb(ORANGE), radii=0.03))
-        self._log("path", LineStrips3D([_flat(self._poses[:, :2])], colors=_rgb(BLUE), radii=0.03))
-        self._landmarks(mapper)
+        self._lines("path", [self._poses[:, :2]], BLUE, 0.03)
+        self._landmarks(mapper.belief)
 
-    def end(self, graph: Graph) -> None:
-        """Show the topological map."""
-        from rerun import LineStrips3D
+    def end(self, survey: Survey) -> None:
+        """Show all as it is known at the end, and the arcs of the topological map."""
+        from jaxslam.plot.sheet import BLUE, GREEN
 
-        from jaxslam.plot.sheet import GREEN
-
-        self._log(
-            "map/arcs",
-            LineStrips3D([_flat(line) for line in graph.lines], colors=_rgb(GREEN), radii=0.02),
-        )
+        self._lines("path", [survey.poses[:, :2]], BLUE, 0.03)
+        self._landmarks(survey.belief)
+        self._lines("map/arcs", survey.graph.lines, GREEN, 0.02)
         self._stream.disconnect()
 
-    def _landmarks(self, mapper: Mapper) -> None:
+    def _lines(self, name: str, lines: Sequence[np.ndarray], colour: str, radius: float) -> None:
+        from rerun import LineStrips3D
+
+        flat = [_flat(line) for line in lines]
+        self._log(name, LineStrips3D(flat, colors=_rgb(colour), radii=radius))
+
+    def _landmarks(self, belief: Belief) -> None:
         from rerun import LineStrips3D, Points3D
 
         from jaxslam.plot.places import MARKS
         from jaxslam.plot.sheet import SIGMAS
 
-        belief = mapper.belief
         counts = np.asarray(slam.confirmed(self._config, belief))
         place, own = np.asarray(belief.places, np.float64), np.asarray(blocks_of(belief.map_cov))
         angle = np.linspace(-np.pi, np.pi, 25)

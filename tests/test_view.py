@@ -69,7 +69,7 @@ def test_each_scan_is_shown_where_it_was_made(drive, rerun, tmp_path):
     shown = view.View(CONFIG, times, scans, tmp_path / "run.rrd")
     for now in told:
         shown.watch(*now)
-    shown.end(survey.graph)
+    shown.end(survey)
     stream = Stream.last
     assert stream.target == tmp_path / "run.rrd" and stream.closed
     seen = [(time, what) for name, time, what in stream.told if name == "world/scan"]
@@ -117,5 +117,5 @@ def test_rerun_takes_what_it_is_told(drive, tmp_path):
     shown = view.View(CONFIG, times, scans, tmp_path / "run.rrd")
     for now in told:
         shown.watch(*now)
-    shown.end(survey.graph)
+    shown.end(survey)
     assert (tmp_path / "run.rrd").stat().st_size > 1000

@@ -22,7 +22,7 @@ from jaxslam.smoother import Records, Track
 from jaxslam.types import Array
 
 DOUBT = 3.0  # [std] from which a feature is hardly believed
-SETTLED = 1e-6  # part of the cost: an iteration that takes less of it is the last
+SETTLED = 1e-5  # part of the cost: an iteration that takes less of it is the last
 HALVINGS = 8  # of a step that raises the cost; after these it is not taken
 
 

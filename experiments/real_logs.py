@@ -105,17 +105,17 @@ def look(known: Known) -> Seen:
         i, j = match_times(recording.times, known.reference[0]).T
         truth[i] = seen_from(known.reference[1][j[0]], known.reference[1][j])
         judged[i] = True
-    found = {}
+    surveys: dict[str, online.Survey] = {}
 
     def survey(odometry: str) -> None:
         by_scans = odometry == "scan"
         given = config, log_noise(aligned=by_scans), jnp.zeros(3), motion, scans
-        found[odometry] = online.survey(*given, aligned=by_scans, smooth=True)
+        surveys[odometry] = online.survey(*given, aligned=by_scans, smooth=True)
 
     one_core.pin()
     taken = one_core.least({name: (survey, name) for name in ODOMETRY}, repeats=1)
     one_core.unpin()
-    found = found["scan"]
+    found = surveys["scan"]
     config = config._replace(landmarks=found.belief.seen.size)  # as many as it grew to
     log = Log(truth, motion, found.nodes, None, judged, aligned=found.aligned)
     return Seen(config, logs.real(log), {name: 1e3 * s / len(motion) for name, s in taken.items()})
@@ -149,8 +149,9 @@ def row(
     """Errors of one way to do it, and the estimated positions (T, 2)."""
     log = given(seen.log, odometry, landmarks)
     start = slam.init(seen.config, jnp.zeros(3))
-    belief, info = slam.run(seen.config, noise, start, monte_carlo.inputs_of(log))
-    inputs, info = jax.tree.map(np.asarray, (monte_carlo.inputs_of(log), info))
+    inputs = monte_carlo.inputs_of(log)
+    belief, info = slam.run(seen.config, noise, start, inputs)
+    inputs, info = jax.tree.map(np.asarray, (inputs, info))
     filtered = np.asarray(info.pose, np.float64)
     poses, _ = online.smoothed(seen.config, noise, jnp.zeros(3), inputs, info, belief)
     numbers: common.Numbers = {"nees": None}

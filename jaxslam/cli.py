@@ -199,8 +199,8 @@ def run(
             numbers["nees"] = report.nees_of(error, np.asarray(survey.info.pose_cov))
         if blind:
             numbers |= report.judged(recording, poses, known, verified)
-            own = report.judged(recording, filtered, known, verified)
-            numbers |= {"filter": own} if smooth else {}
+            if smooth:
+                numbers["filter"] = report.judged(recording, filtered, known, verified)
             numbers["dead_reckoning"] = blind
         report.write(place, numbers, recording.times, survey)
         told = jnp.asarray(motions, float)

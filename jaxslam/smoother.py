@@ -158,17 +158,23 @@ def _residuals(records: Records, state: State) -> tuple[State, Rows]:
     return (times(root, motion), times(records.r, seen)), rows
 
 
-def with_lines(records: Records, places: Array) -> Array:
+def _with_lines(records: Records, places: Array) -> Array:
     """Wrap the directions of walls that are seen, among `places` (L, 2)."""
     wall = jnp.any(records.r != 0.0, axis=(-2, -1)) & (records.kind == WALL)
     wall = jnp.zeros(places.shape[0], bool).at[records.which].max(wall)
     return places.at[:, 0].set(jnp.where(wall, wrap_line(places[:, 0]), places[:, 0]))
 
 
+def wrapped(records: Records, state: State) -> State:
+    """A state with its headings and directions of walls in their ranges."""
+    poses, places = state
+    return poses.at[:, 2].set(wrap_angle(poses[:, 2])), _with_lines(records, places)
+
+
 def evaluate(records: Records, state: State) -> tuple[Array, State, Rows, Array]:
     """Squared Mahalanobis norm () of all residuals, these, their rows, and the prior's pull."""
     residuals, rows = _residuals(records, state)
-    off = with_lines(records, state[1] - records.prior.places)
+    off = _with_lines(records, state[1] - records.prior.places)
     pull = times(records.prior.information, off)  # (L, 2) half the gradient of the prior's part
     return sum(jnp.sum(x**2) for x in residuals) + jnp.sum(off * pull), residuals, rows, pull
 
@@ -237,9 +243,5 @@ def smooth(records: Records, poses: Array, places: Array, *, iterations: int = 1
         return jax.tree.map(lambda x, y: jnp.where(part > 0.0, x, y), new, state), cost
 
     state, costs = lax.scan(body, (poses, places), None, length=iterations)
-    poses, places = state
-    return Track(
-        poses=poses.at[:, 2].set(wrap_angle(poses[:, 2])),
-        places=with_lines(records, places),
-        cost=jnp.append(costs, evaluate(records, state)[0]),
-    )
+    cost = jnp.append(costs, evaluate(records, state)[0])
+    return Track(*wrapped(records, state), cost)

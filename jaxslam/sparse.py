@@ -17,7 +17,6 @@ from scipy.sparse.linalg import splu
 
 from jaxslam import arrow, smoother
 from jaxslam.arrow import Rows, State
-from jaxslam.geometry import wrap_angle
 from jaxslam.smoother import Records, Track
 from jaxslam.types import Array
 
@@ -26,29 +25,22 @@ SETTLED = 1e-5  # part of the cost: an iteration that takes less of it is the la
 HALVINGS = 8  # of a step that raises the cost; after these it is not taken
 
 
+_prepared = jax.jit(smoother.prepared, static_argnums=1)
+_wrapped = jax.jit(smoother.wrapped)
+
+
 @jax.jit
 def _evaluate(records: Records, state: State, doubt: Array) -> tuple[Array, State, Rows]:
     """Cost (), its gradient over two, and the rows of the reweighted residuals."""
-    places = state[1]
-    own = smoother.prepared(records, places.shape[0])
-    cost, (motion, seen), rows, pull = smoother.evaluate(own, state)
+    cost, (motion, seen), rows, pull = smoother.evaluate(records, state)
     square = jnp.sum(seen**2, axis=-1)
     cost += jnp.sum(doubt**2 * jnp.log1p(square / doubt**2) - square)
     root = (1.0 / jnp.sqrt(1.0 + square / doubt**2))[..., None]
     rows = rows._replace(
         by_pose=root[..., None] * rows.by_pose, by_place=root[..., None] * rows.by_place
     )
-    slope = arrow.gradient(rows, (motion, root * seen), places.shape[0])
+    slope = arrow.gradient(rows, (motion, root * seen), state[1].shape[0])
     return cost, (slope[0], slope[1] + pull), rows
-
-
-@jax.jit
-def _wrapped(records: Records, state: State) -> State:
-    """Headings and directions of walls in their ranges."""
-    poses, places = state
-    own = smoother.prepared(records, places.shape[0])
-    poses = poses.at[:, 2].set(wrap_angle(poses[:, 2]))
-    return poses, smoother.with_lines(own, places)
 
 
 Blocks = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -121,7 +113,8 @@ def smooth(
     extra = np.zeros((size, 2, 2)) if records.prior is None else records.prior.information
     limit = np.float64(min(doubt, 1e9))  # from which the logarithm is a square
     with jax.enable_x64(True):
-        evaluate = lambda state: jax.tree.map(np.asarray, _evaluate(records, state, limit))
+        own = _prepared(records, size)
+        evaluate = lambda state: jax.tree.map(np.asarray, _evaluate(own, state, limit))
         cost, slope, rows = evaluate(state)
         costs = [float(cost)]
         for _ in range(iterations if np.isfinite(cost) else 0):
@@ -140,5 +133,5 @@ def smooth(
             costs.append(float(cost))
             if fallen <= SETTLED * cost:
                 break
-        poses, places = jax.tree.map(np.asarray, _wrapped(records, state))
+        poses, places = jax.tree.map(np.asarray, _wrapped(own, state))
     return Track(poses, places, np.array(costs))

@@ -38,11 +38,13 @@ def match(distance: Array, possible: Array, *, gate: float, margin: float) -> Ar
     """
     m, l = distance.shape
     d = jnp.where(possible & jnp.isfinite(distance), distance, jnp.inf)
-    best = jnp.argmin(d, axis=1)
-    nearest = jnp.take_along_axis(d, best[:, None], axis=1)[:, 0]
-    others = jnp.where(jnp.arange(l)[None] == best[:, None], jnp.inf, d)
+    # The first of the least: two plain reductions are many times as fast as `argmin`.
+    index = jnp.arange(l, dtype=jnp.int32)[None]
+    nearest = jnp.min(d, axis=1)
+    best = jnp.min(jnp.where(d == nearest[:, None], index, l - 1), axis=1)
+    others = jnp.where(index == best[:, None], jnp.inf, d)
     clear = jnp.min(others, axis=1) > nearest + margin
-    mutual = jnp.argmin(d, axis=0)[best] == jnp.arange(m)
+    mutual = jnp.argmin(d[:, best], axis=0) == jnp.arange(m)
     return jnp.where((nearest < gate) & clear & mutual, best, l).astype(jnp.int32)
 
 

@@ -21,6 +21,7 @@ from jaxslam.types import Array
 
 GUARD = 2  # units of rounding by which each update raises the variances
 LARGE = 256  # rows of a map above which it pays to leave zeros out
+STRIP = 192  # rows of a covariance that are worked on at a time
 ROOM = 96  # rows that are put off at most
 
 
@@ -29,14 +30,15 @@ class Postponed(NamedTuple):
 
     base: Array  # (n, n)
     rows: Array  # (ROOM, n) those that are put off, then zeros
+    sums: Array  # (2, n) over them: of each number squared, and of it times the next
     held: Array  # () int32 how many
     updates: Array  # () in how many updates
 
 
 def postpone(cov: Array) -> Postponed:
     """A covariance (n, n), from here on put off."""
-    none = jnp.zeros((ROOM, len(cov)), cov.dtype)
-    return Postponed(cov, none, jnp.int32(0), jnp.zeros((), cov.dtype))
+    none = jnp.zeros((ROOM + 2, len(cov)), cov.dtype)
+    return Postponed(cov, none[2:], none[:2], jnp.int32(0), jnp.zeros((), cov.dtype))
 
 
 def settle(cov: Array | Postponed) -> Array:
@@ -45,7 +47,24 @@ def settle(cov: Array | Postponed) -> Array:
         return cov
     at = jnp.arange(len(cov.base), dtype=jnp.int32)
     raised = 1 + GUARD * np.finfo(cov.base.dtype).eps * cov.updates
-    return (cov.base - cov.rows.T @ cov.rows).at[at, at].multiply(raised, unique_indices=True)
+    return _settled(cov.base, cov.rows).at[at, at].multiply(raised, unique_indices=True)
+
+
+def _settled(base: Array, rows: Array) -> Array:
+    """`base` - rows^T rows, a strip at a time in place, as far as any row is not zero."""
+    columns, size = rows.T, len(base)
+
+    def strip(k: Array, now: Array) -> Array:
+        own = lambda x: lax.dynamic_slice_in_dim(x, k * STRIP, STRIP)
+        return lax.dynamic_update_slice_in_dim(now, own(now) - own(columns) @ rows, k * STRIP, 0)
+
+    whole, rest = divmod(size, STRIP)
+    if rest:
+        base = base.at[size - rest :].add(-columns[size - rest :] @ rows)
+    used = jnp.any(rows != 0.0, axis=0)[: whole * STRIP].reshape(whole, STRIP)
+    index = jnp.arange(1, whole + 1, dtype=jnp.int32)
+    last = jnp.max(jnp.where(jnp.any(used, axis=1), index, 0), initial=0)
+    return lax.fori_loop(0, last, strip, base)
 
 
 def make_room(cov: Array | Postponed, more: int) -> Array | Postponed:
@@ -71,9 +90,8 @@ def blocks_of(cov: Array | Postponed) -> Array:
         size = len(cov) // 2
         index = jnp.arange(size, dtype=jnp.int32)
         return cov.reshape(size, 2, size, 2)[index, :, index]
-    x, y = (cov.rows[:, k::2] for k in range(2))
-    across = jnp.sum(x * y, axis=0)
-    put_off = jnp.stack([jnp.sum(x * x, axis=0), across, across, jnp.sum(y * y, axis=0)], axis=-1)
+    square, across = cov.sums.reshape(2, -1, 2).swapaxes(1, 2)
+    put_off = jnp.stack([square[0], across[0], across[0], square[1]], axis=-1)
     return blocks_of(cov.base) - put_off.reshape(-1, 2, 2)
 
 
@@ -93,7 +111,9 @@ def subtract(cov: Array | Postponed, y: Array, seen: Array) -> Array | Postponed
         first = y[jnp.argsort(~some, stable=True)]
         rows = lax.dynamic_update_slice(cov.rows, first, (cov.held, jnp.int32(0)))
         held = cov.held + jnp.sum(some, dtype=jnp.int32)
-        return Postponed(cov.base, rows, held, cov.updates + seen.astype(y.dtype))
+        of_next = jnp.pad(y[:, 1:], ((0, 0), (0, 1)))
+        sums = cov.sums + jnp.stack([jnp.sum(y * y, axis=0), jnp.sum(y * of_next, axis=0)])
+        return Postponed(cov.base, rows, sums, held, cov.updates + seen.astype(y.dtype))
     half = len(y) // 2 if len(cov) > LARGE else len(y)
     # Rows that count come first, and of a large map seldom are more than half of all.
     if half < len(y):
@@ -119,9 +139,9 @@ def subtract_seldom(cov: Array | Postponed, y: Array, wanted: Array) -> Array | 
 
 
 def put_rows(cov: Array | Postponed, rows: Array, at: Array) -> Array | Postponed:
-    """Replace some rows and columns, which is seldom wanted: `linalg.put_rows`."""
+    """Replace the rows and columns of some slots, seldom wanted: `linalg.put_rows`."""
     if not isinstance(cov, Postponed):
         return put_in(cov, rows, at)
     how = {"mode": "drop", "unique_indices": True}
-    put_off = cov.rows.at[:, at].set(jnp.zeros((), rows.dtype), **how)
-    return cov._replace(base=put_in(cov.base, rows, at), rows=put_off)
+    zero = lambda x: x.at[:, at].set(jnp.zeros((), x.dtype), **how)
+    return cov._replace(base=put_in(cov.base, rows, at), rows=zero(cov.rows), sums=zero(cov.sums))

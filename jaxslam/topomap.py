@@ -25,6 +25,7 @@ ROOM = 0.4  # [m] around the end of a frontier that must be seen for it to be ex
 SKIN = 0.2  # [m] behind what was hit there is wall
 SAME_END = 1.0  # [m] ends of frontiers of one node this close are one
 CHORD = 0.3  # [m] between two ends from which their direction turns the line between them
+AROUND = 64  # ends of frontiers that are looked around in one scan at most, the nearest
 TWINS = 8  # arcs of the same ends that are compared with a link at most
 THROUGH = 0.5  # of its clearance: an arc this close to a node goes through it
 
@@ -99,12 +100,20 @@ _attach = jax.jit(attach)
 
 
 def _explored(arcs: Arcs, pose: Array, scan: Scan, lidar: Lidar) -> Array:
-    """Frontiers (A,) whose end, and all around it, a scan sees to be free or wall."""
-    rim = ROOM * unit(jnp.linspace(-jnp.pi, jnp.pi, 8, endpoint=False, dtype=pose.dtype))
-    places = jnp.concatenate([jnp.zeros_like(rim[:1]), rim])[None] + arcs.line[:, -1:]
-    own = to_robot(pose, places)  # (A, 9, 2)
+    """Slots (AROUND,) of frontiers whose end, and all around it, a scan sees to be free or wall.
+
+    A for none. Few ends are in view: it is looked around those alone.
+    """
+    size = arcs.seen.size
     reach = scan.ranges + jnp.where(scan.hit, SKIN, 0.0).astype(scan.ranges.dtype)
-    return jnp.all(before_ends(own, reach, lidar), axis=1) & (arcs.ends[:, 1] < 0)
+    own = to_robot(pose, arcs.line[:, -1])
+    seen = before_ends(own, reach, lidar) & (arcs.ends[:, 1] < 0) & (arcs.seen > 0)
+    away = jnp.where(seen, jnp.sum(own**2, axis=1), jnp.inf)
+    less, slot = lax.top_k(-away, min(AROUND, size))
+    rim = ROOM * unit(jnp.linspace(-jnp.pi, jnp.pi, 8, endpoint=False, dtype=pose.dtype))
+    rim = to_robot(pose, rim[None] + arcs.line[slot, -1:])  # (AROUND, 8, 2)
+    all_round = (less > -jnp.inf) & jnp.all(before_ends(rim, reach, lidar), axis=1)
+    return jnp.where(all_round, slot, size).astype(jnp.int32)
 
 
 def _check(ids: Array, pose: Array, links: Links, scan: Scan, lidar: Lidar) -> None:
@@ -151,7 +160,7 @@ def add(arcs: Arcs, ids: Array, pose: Array, links: Links, scan: Scan, lidar: Li
     good &= ~repeated(ends, line, good)
 
     # The arcs with the ends of each link, (P, TWINS), laid on it.
-    alike = jnp.all(ends[:, None] == arcs.ends[None], axis=2) & (arcs.seen > 0)[None]
+    alike = (ends[:, :1] == arcs.ends[None, :, 0]) & (ends[:, 1:] == arcs.ends[None, :, 1])
     alike, other = lax.top_k(alike.astype(line.dtype), min(TWINS, size))
     old = arcs.line[other]
     first = jnp.broadcast_to(line[:, None, 0], (*other.shape, 2))
@@ -196,10 +205,9 @@ def add(arcs: Arcs, ids: Array, pose: Array, links: Links, scan: Scan, lidar: Li
 
 
 def _forget(arcs: Arcs, gone: Array) -> Arcs:
-    """Free the slots (A,) bool."""
-    return arcs._replace(
-        ends=jnp.where(gone[:, None], -1, arcs.ends), seen=jnp.where(gone, 0, arcs.seen)
-    )
+    """Free some slots; A for none."""
+    free = lambda x, what: x.at[gone].set(jnp.int32(what), mode="drop")
+    return arcs._replace(ends=free(arcs.ends, -1), seen=free(arcs.seen, 0))
 
 
 def _nodes(

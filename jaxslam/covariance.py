@@ -30,7 +30,7 @@ class Postponed(NamedTuple):
 
     base: Array  # (n, n)
     rows: Array  # (ROOM, n) those that are put off, then zeros
-    sums: Array  # (2, n) over them: of each number squared, and of it times the next
+    sums: Array  # (2, n) over them: each number squared, and every second times the next
     held: Array  # () int32 how many
     updates: Array  # () in how many updates
 
@@ -52,19 +52,20 @@ def settle(cov: Array | Postponed) -> Array:
 
 def _settled(base: Array, rows: Array) -> Array:
     """`base` - rows^T rows, a strip at a time in place, as far as any row is not zero."""
-    columns, size = rows.T, len(base)
+    columns = rows.T
+    whole, rest = divmod(len(base), STRIP)
+    if rest:
+        base = base.at[-rest:].add(-columns[-rest:] @ rows)
+    if not whole:
+        return base
 
     def strip(k: Array, now: Array) -> Array:
         own = lambda x: lax.dynamic_slice_in_dim(x, k * STRIP, STRIP)
         return lax.dynamic_update_slice_in_dim(now, own(now) - own(columns) @ rows, k * STRIP, 0)
 
-    whole, rest = divmod(size, STRIP)
-    if rest:
-        base = base.at[size - rest :].add(-columns[size - rest :] @ rows)
-    used = jnp.any(rows != 0.0, axis=0)[: whole * STRIP].reshape(whole, STRIP)
-    index = jnp.arange(1, whole + 1, dtype=jnp.int32)
-    last = jnp.max(jnp.where(jnp.any(used, axis=1), index, 0), initial=0)
-    return lax.fori_loop(0, last, strip, base)
+    used = jnp.any(columns[: whole * STRIP].reshape(whole, -1) != 0.0, axis=1)
+    number = jnp.arange(1, whole + 1, dtype=jnp.int32)
+    return lax.fori_loop(0, jnp.max(jnp.where(used, number, 0)), strip, base)
 
 
 def make_room(cov: Array | Postponed, more: int) -> Array | Postponed:
@@ -139,9 +140,12 @@ def subtract_seldom(cov: Array | Postponed, y: Array, wanted: Array) -> Array | 
 
 
 def put_rows(cov: Array | Postponed, rows: Array, at: Array) -> Array | Postponed:
-    """Replace the rows and columns of some slots, seldom wanted: `linalg.put_rows`."""
+    """Replace some rows and columns, which is seldom wanted: `linalg.put_rows`."""
     if not isinstance(cov, Postponed):
         return put_in(cov, rows, at)
     how = {"mode": "drop", "unique_indices": True}
-    zero = lambda x: x.at[:, at].set(jnp.zeros((), x.dtype), **how)
-    return cov._replace(base=put_in(cov.base, rows, at), rows=zero(cov.rows), sums=zero(cov.sums))
+    put_off = cov.rows.at[:, at].set(jnp.zeros((), rows.dtype), **how)
+    # Of either number of a slot, its product with the other.
+    both = jnp.stack([at, at - at % 2])
+    sums = cov.sums.at[jnp.arange(2, dtype=jnp.int32)[:, None], both].set(0.0, mode="drop")
+    return cov._replace(base=put_in(cov.base, rows, at), rows=put_off, sums=sums)

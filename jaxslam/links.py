@@ -5,6 +5,8 @@ Where two ids meet, there is a link; where an id comes to the end of what was se
 The arrival steps lead back from there to the junctions, and so give the link its line.
 """
 
+from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -12,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.batches import one_by_one
 from jaxslam.grid import GridSpec, cell_of, centre_of, seen_free
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.nodes import Nodes, NodeSpec
@@ -87,8 +90,7 @@ class _Ids(NamedTuple):
     """The ids of the junctions, expanded along the branches."""
 
     own: Array  # (H, W) bit sets of ids
-    when: Array  # (H, W) int32 step of arrival, -1 where none arrived
-    branch: Array  # (H, W) bool, cells of branches, one thick
+    far: Array  # (H, W) int16 twice the step of arrival, and one in a cell of a branch; -1 for none
 
 
 def _some(mask: Array) -> Array:
@@ -99,12 +101,13 @@ def _some(mask: Array) -> Array:
     return jnp.where(score > -jnp.inf, cell, mask.size).astype(jnp.int32)
 
 
-def _largest(cells: Array) -> Array:
-    """Largest (H, W) of each cell and the eight around it."""
-    p = jnp.pad(cells, ((1, 1), (0, 0)), mode="edge")
-    cells = jnp.maximum(jnp.maximum(p[:-2], p[2:]), cells)
-    p = jnp.pad(cells, ((0, 0), (1, 1)), mode="edge")
-    return jnp.maximum(jnp.maximum(p[:, :-2], p[:, 2:]), cells)
+def _over(cells: Array, how: Callable, reach: int) -> Array:
+    """`how` over the square of `reach` cells about each (H, W), of cells with so many around."""
+    for axis in range(2):
+        size = cells.shape[axis] - 2 * reach
+        some = (lax.slice_in_dim(cells, k, k + size, axis=axis) for k in range(2 * reach + 1))
+        cells = reduce(how, some)
+    return cells
 
 
 def _top(score: Array, cells: Array, count: int, reach: int, width: int) -> tuple[Array, Array]:
@@ -158,24 +161,31 @@ def find_links(
     place = jnp.where(valid[:, None], place, 0.0)
     bit = id_bits(spec.nodes)
     seeds = _seeds(place, valid, bit, grid)
-    branch = branches(diagram, sources)
-    thick = (block_union(branch.astype(jnp.uint8)) > 0) & (diagram.labels != 0) & ~sources
-    met = expand(seeds, thick | (seeds != 0), steps=LINK_STEPS)
-    ids = _Ids(met.labels, met.arrival, branch)
-
-    unseen = (diagram.labels == 0) & ~sources & ~seen_free(scan, lidar, grid)
+    ids = one_by_one(_spread)(seeds, diagram, sources)
+    free = one_by_one(lambda scan: seen_free(scan, lidar, grid))(scan)
+    unseen = (diagram.labels == 0) & ~sources & ~free
     wide = diagram.arrival > round(spec.least / grid.cell)  # steps, no fewer than cells to a wall
     reach = round(TWIN / grid.cell)
     some = [_meets(ids, place, grid, bit, reach), _ends(ids, unseen, wide, bit, reach)]
     pair, cell, good = (jnp.concatenate(x) for x in zip(*some, strict=True))
-    line, length, clearance = jax.vmap(_measure, in_axes=(0, 0, None, None, None, None, None))(
-        pair, cell, ids, bit, place, grid, jnp.where(scan.hit[:, None], points(scan, lidar), 1e3)
+    hits = jnp.where(scan.hit[:, None], points(scan, lidar), 1e3)
+    line, length, clearance = jax.vmap(_measure, in_axes=(0, 0, 0, None, None, None))(
+        pair, cell, one_by_one(_back)(pair, cell, ids, bit), place, grid, hits
     )
     shape = jnp.append(found.shape[: spec.nodes], jnp.inf)
     clearance = jnp.minimum(clearance, jnp.min(shape[pair], axis=1))
     good &= (pair[:, 1] >= 0) | (clearance > spec.least)
     good &= ~repeated(pair, line, good)
     return Links(pair=pair, line=line, length=length, clearance=clearance, valid=good)
+
+
+def _spread(seeds: Array, diagram: Diagram, sources: Array) -> _Ids:
+    """Ids from their seeds (H, W) along the branches of a diagram, which are three cells wide."""
+    branch = branches(diagram, sources)
+    thick = (block_union(branch.astype(jnp.uint8)) > 0) & (diagram.labels != 0) & ~sources
+    met = expand(seeds, thick | (seeds != 0), steps=LINK_STEPS)
+    far = 2 * met.arrival.astype(jnp.int16) + branch.astype(jnp.int16)
+    return _Ids(met.labels, jnp.where(met.arrival >= 0, far, jnp.int16(-1)))
 
 
 def _seeds(place: Array, valid: Array, bit: Array, grid: GridSpec) -> Array:
@@ -190,6 +200,12 @@ def _seeds(place: Array, valid: Array, bit: Array, grid: GridSpec) -> Array:
     return jnp.zeros(grid.shape, bit.dtype).at[row, cell[..., 1]].add(own, mode="drop")
 
 
+def _shared(own: Array) -> Array:
+    """Bit sets (H, W) of ids that meet: in a cell, or evenly, one here and another next door."""
+    beside = reduce(jnp.bitwise_or, around(single(own)))
+    return own | jnp.where(single(own) != 0, beside, jnp.zeros_like(beside))
+
+
 def _meets(
     ids: _Ids, place: Array, grid: GridSpec, bit: Array, reach: int
 ) -> tuple[Array, Array, Array]:
@@ -197,16 +213,13 @@ def _meets(
 
     Each pair may meet twice, in places that are far from each other.
     """
-    # An even meet: one id here, another next door.
-    beside = jnp.zeros_like(ids.own)
-    for other in around(single(ids.own)):
-        beside |= other
-    both = ids.own | jnp.where(single(ids.own) != 0, beside, jnp.zeros_like(beside))
+    both = _shared(ids.own)
     # Few cells hold two: all that follows is done on these.
     where = _some((both & (both - 1)) != 0)
     take = lambda x, fill: x.reshape(-1).at[where].get(mode="fill", fill_value=fill)
-    off_branch = jnp.where(take(ids.branch, False), 0.0, 2.5).astype(place.dtype)
-    early = -take(ids.when, 0).astype(place.dtype) - off_branch
+    far = take(ids.far, 0)
+    off_branch = jnp.where(far % 2 == 1, 0.0, 2.5).astype(place.dtype)
+    early = -(far // 2).astype(place.dtype) - off_branch
     held, width = take(both, 0), grid.shape[1]
     middle = centre_of(jnp.stack([where // width, where % width], axis=-1), grid)
     from_ids = jnp.linalg.norm(middle.astype(place.dtype)[None] - place[:, None], axis=-1)
@@ -224,24 +237,21 @@ def _meets(
     return pair[order], cell[order], valid[order]
 
 
+def _outermost(ids: _Ids, unseen: Array, wide: Array) -> Array:
+    """Cells (H, W) of one id, farther from its junction than all near them, next to unseen ones."""
+    around_it = _over(jnp.pad(ids.own, 2), jnp.bitwise_or, 2)
+    edge = _over(jnp.pad(unseen, 2, constant_values=True), jnp.logical_or, 2)
+    farthest = _over(jnp.pad(ids.far, 3, constant_values=-1), jnp.maximum, 3)
+    alone = (single(ids.own) != 0) & (around_it == ids.own)
+    return alone & (ids.far > 1) & (ids.far == farthest) & edge & wide
+
+
 def _ends(
     ids: _Ids, unseen: Array, wide: Array, bit: Array, reach: int
 ) -> tuple[Array, Array, Array]:
-    """Where branches leave the view: pairs (FRONTIERS, 2) of id and -1, cells, and whether.
-
-    Such an end is farther from its junction than the cells around it, and next to unseen ones.
-    """
-    own = single(ids.own)
-    around_it = block_union(block_union(ids.own))
-    edge = block_union(block_union(jnp.pad(unseen, 1, constant_values=True).astype(jnp.uint8)))
-    far = jnp.where(ids.when >= 0, 2 * ids.when + ids.branch.astype(jnp.int32), -1)
-    far = far.astype(jnp.int16)
-    farthest = far
-    for _ in range(3):
-        farthest = _largest(farthest)
-    end = (own != 0) & (around_it == own) & (ids.when > 0) & (far == farthest)
-    end &= (edge[1:-1, 1:-1] > 0) & wide
-    where = _some(end)
+    """Where branches leave the view: pairs (FRONTIERS, 2) of id and -1, cells, and whether."""
+    own, far = single(ids.own), ids.far
+    where = _some(one_by_one(_outermost)(ids, unseen, wide))
     score = far.reshape(-1).at[where].get(mode="fill", fill_value=-1).astype(float)
     score = jnp.where(where < far.size, score, -jnp.inf)
     cell, valid = _top(score, where, FRONTIERS, reach, far.shape[1])
@@ -249,44 +259,61 @@ def _ends(
     return jnp.stack([node, jnp.full_like(node, -1)], axis=1), cell, valid
 
 
-def _back(cell: Array, own: Array, ids: _Ids) -> tuple[Array, Array]:
-    """Cells (S,) from `cell` back to where the id with the bit `own` came from, and if it moved.
+def _back(pair: Array, cell: Array, ids: _Ids, bit: Array) -> tuple[Array, Array]:
+    """Cells (P, 2, S) from those (P,) in which ids met back to where both of them came from.
 
-    Each step goes to a cell that the id reached earlier: on the branch where one is.
+    Each step goes to a cell that the id reached earlier: on the branch where one is. And whether
+    (P, 2, S) it is a step: none is from where an id came from, nor back to the -1 of a frontier.
     """
-    w = ids.when.shape[1] + 2  # a ring of cells around
+    w = ids.far.shape[1] + 2  # a ring of cells around
     own_at = jnp.pad(ids.own, 1).reshape(-1)
-    when = jnp.pad(ids.when, 1, constant_values=-1).reshape(-1)
-    price = when * 2 - 5 * jnp.pad(ids.branch, 1).reshape(-1).astype(jnp.int32)
+    far_at = jnp.pad(ids.far, 1, constant_values=-1).reshape(-1)
     beside = jnp.array([-w - 1, -w, -w + 1, -1, 1, w - 1, w, w + 1], jnp.int32)
+    own = bit[jnp.where(pair < 0, len(bit) - 1, pair)][..., None]  # the last is nobody's
 
-    def step(now: tuple[Array, Array], _: None):
-        at, limit = now
-        near = at + beside
-        good = (own_at[near] == own) & (when[near] < limit)
-        best = near[jnp.argmin(jnp.where(good, price[near], jnp.iinfo(jnp.int32).max))]
-        moved = jnp.any(good)
-        at = jnp.where(moved, best, at)
-        return (at, jnp.where(moved, when[at], limit)), (at, moved)
+    def step(now: tuple[Array, ...]) -> tuple[Array, ...]:
+        k, at, limit, cells, moved = now
+        near = at[..., None] + beside[None, None]
+        far = far_at[near]
+        good = (own_at[near] == own) & (far // 2 < limit[..., None])
+        # A cell of a branch is worth two steps.
+        price = jnp.where(good, far - 6 * (far % 2), jnp.iinfo(far.dtype).max)
+        best = jnp.argmin(price, axis=-1, keepdims=True)
+        can = jnp.any(good, axis=-1)
+        take = lambda x: jnp.take_along_axis(x, best, axis=-1)[..., 0]
+        at = jnp.where(can, take(near), at)
+        limit = jnp.where(can, take(far) // 2, limit)
+        return k + 1, at, limit, cells.at[k].set(at), moved.at[k].set(can)
 
     start = (cell // (w - 2) + 1) * w + cell % (w - 2) + 1
+    start = jnp.broadcast_to(start[:, None], pair.shape)
     # The first step may go to a cell that was reached as early: an even meet.
-    _, (at, moved) = lax.scan(step, (start, when[start] + 1), length=LINK_STEPS)
+    begin = jnp.int32(0), start, far_at[start] // 2 + 1
+    blank = jnp.zeros((LINK_STEPS, *pair.shape), jnp.int32)
+    go_on = lambda now: (now[0] < LINK_STEPS) & ((now[0] == 0) | jnp.any(now[4][now[0] - 1]))
+    _, _, _, at, moved = lax.while_loop(go_on, step, (*begin, blank, blank.astype(bool)))
+    at, moved = (jnp.moveaxis(x, 0, -1) for x in (at, moved))
     return (at // w - 1) * (w - 2) + at % w - 1, moved
 
 
 def _measure(
-    pair: Array, cell: Array, ids: _Ids, bit: Array, place: Array, grid: GridSpec, hits: Array
+    pair: Array,
+    cell: Array,
+    back: tuple[Array, Array],
+    place: Array,
+    grid: GridSpec,
+    hits: Array,
 ) -> tuple[Array, Array, Array]:
-    """Line (K, 2), length and clearance of the link of a `pair` (2,) that met in a `cell`."""
+    """Line (K, 2), length and clearance of a link of a `pair` (2,) that met in a `cell`.
+
+    `back` are the cells (2, S) from there, and whether they are steps.
+    """
     at = lambda flat: centre_of(
         jnp.stack([flat // grid.shape[1], flat % grid.shape[1]], axis=-1), grid
     ).astype(place.dtype)
     middle = at(cell)
     sides = []
-    for end in (pair[0], pair[1]):
-        # The last bit is nobody's: from a frontier, nothing leads back to a second end.
-        cells, moved = _back(cell, bit[jnp.where(end < 0, len(bit) - 1, end)], ids)
+    for end, cells, moved in zip(pair, *back, strict=True):
         last = jnp.where(end < 0, middle, place[end])
         way = jnp.where(moved[:, None], at(cells), last[None])
         sides.append((jnp.concatenate([way, last[None]]), jnp.append(~moved, True)))

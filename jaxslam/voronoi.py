@@ -7,15 +7,15 @@ cell passes nothing on, which makes the diagonal bisector of the Manhattan dista
 """
 
 from collections.abc import Callable
-from functools import cache, partial, reduce
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_batching import custom_vmap
 
+from jaxslam.batches import one_by_one
 from jaxslam.types import Array, expect
 
 
@@ -120,21 +120,6 @@ def _fronts(start: Array, steps: int, octagon: bool) -> tuple[Array, Array]:
     return even, waited
 
 
-@cache
-def _batched(steps: int, octagon: bool) -> Callable[[Array], tuple[Array, Array]]:
-    """`_fronts` that takes the grids of a batch one by one on a CPU: each stays in its cache."""
-    fronts = custom_vmap(partial(_fronts, steps=steps, octagon=octagon))
-
-    @fronts.def_vmap
-    def _(size: int, batched: list[bool], start: Array):
-        del size, batched
-        one_by_one = partial(lax.map, fronts)
-        together = jax.vmap(partial(_fronts, steps=steps, octagon=octagon))
-        return lax.platform_dependent(start, cpu=one_by_one, default=together), (True, True)
-
-    return fronts
-
-
 class Fronts(NamedTuple):
     """How far fronts of sources with one label each have come."""
 
@@ -173,7 +158,8 @@ def grow(start: Array, *, steps: int, octagon: bool = False) -> Fronts:
     expect("start", start, ("H", "W"), jnp.int8)
     if steps < 0:
         raise ValueError(f"steps is {steps}, not 0 or more")
-    cells, waited = _batched(steps, octagon)(jnp.pad(start, 1, constant_values=SHUT))
+    fronts = one_by_one(partial(_fronts, steps=steps, octagon=octagon))
+    cells, waited = fronts(jnp.pad(start, 1, constant_values=SHUT))
     return Fronts(cells[1:-1, 1:-1], waited[1:-1, 1:-1])
 
 

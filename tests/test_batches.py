@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.batches import Spread, map_batches, pad
+from jaxslam.batches import Spread, map_batches, one_by_one, pad
 
 
 def assert_same(one, two):
@@ -34,6 +34,22 @@ def test_padding_repeats_the_last_and_keeps_the_kind_of_array():
         longer = pad(x, to=5)
         assert longer.tolist() == [0, 1, 2, 2, 2] and type(longer) is type(x)
     assert pad(jnp.arange(3), to=3).tolist() == [0, 1, 2]
+
+
+def test_one_by_one_is_vmap_at_any_depth_and_with_what_is_common():
+    both = lambda f: jax.vmap(jax.vmap(f, in_axes=(0, None)), in_axes=(0, 0))
+    some = {"a": jnp.arange(24.0).reshape(2, 3, 4), "b": jnp.arange(6).reshape(2, 3)}
+    other = jnp.arange(8.0).reshape(2, 4)
+    what = lambda item, other: {"x": item["a"] * other, "y": item["b"] + 1}
+    assert_same(jax.jit(both(one_by_one(what)))(some, other), both(what)(some, other))
+
+
+def test_what_is_done_one_by_one_stays_a_decision():
+    """On a CPU no item does what another needs: of a vectorised condition both sides are done."""
+    decide = lambda x: jax.lax.cond(x > 0, lambda x: x, lambda x: -x, x)
+    compiled = lambda f: jax.jit(jax.vmap(f)).lower(jnp.arange(4)).compile().as_text()
+    assert "conditional" in compiled(one_by_one(decide)) and "while" in compiled(one_by_one(decide))
+    assert "conditional" not in compiled(decide)
 
 
 def scaled(power, common, item):

@@ -15,8 +15,9 @@ OPERATIONS = "subtract", "subtract_seldom", "put_rows", "rows_at", "blocks_of", 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Room for few rows, so that it is settled now and then."""
+    """Room for few rows, so that it is settled now and then, in two strips and a rest."""
     monkeypatch.setattr(covariance, "ROOM", 11)
+    monkeypatch.setattr(covariance, "STRIP", 5)
 
 
 def start(rng):

@@ -179,7 +179,7 @@ def _system(
     return square / spec.noise**2, pull / spec.noise**2
 
 
-def _descend(
+def descend(
     spec: AlignSpec,
     lidar: Lidar,
     local: LocalMap,
@@ -242,13 +242,13 @@ def align(
     few = local._replace(surfaces=jax.tree.map(some, local.surfaces), poses=some(local.poses))
     thin = slice(None, None, spec.thin)
     starts = guess[None] + jnp.array([[0.0, 0.0, turn] for turn in spec.turns])
-    find = lambda start: _descend(
+    find = lambda start: descend(
         spec, lidar, few, points[thin], hit[thin], start, wheels_say, spec.far, spec.kernel[0]
     )
     poses, _, explained = jax.vmap(find)(starts)
     off = wrap_angle(poses[:, 2] - guess[2])
     best = jnp.argmax(explained - LIKELY * off**2 / unsure[1])
-    pose, square, explained = _descend(
+    pose, square, explained = descend(
         spec, lidar, local, points, hit, poses[best], wheels_say, spec.near, spec.kernel[1]
     )
     good = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(square))

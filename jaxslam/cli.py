@@ -141,8 +141,8 @@ def run(
         reference: Trajectory to compare with, a TUM file on the log's clock.
         relations: Verified relative poses to compare with, on the log's clock.
         odometry: Scans aligned to those before and fused with the wheels, or the wheels alone.
-        smooth: At the end, tell all poses and places by all that was seen; else each pose stays as
-            the filter told it when it was there.
+        smooth: At the end, tell all poses and places by all that was seen, and by scans laid on
+            those of earlier visits to a place; else each pose stays as the filter told it.
         noise: File of the noise that the filter assumes; by default a cautious one.
         scan_topic: Topic of the laser scans in a bag; by default that with most messages.
         odometry_topic: Topic of the odometry in a bag, or of the transforms; likewise.
@@ -189,6 +189,7 @@ def run(
             "path_length_m": report.length(poses if by_scans else wheels),
             "landmarks": int(np.sum(slam.confirmed(config, survey.belief))),
             "matches": float(np.mean(np.sum(np.asarray(survey.info.used), axis=1))),
+            "closures": len(survey.closures.first) if survey.closures else 0,
             "seconds": seconds,
         }
         lines, error = {"odometry": wheels}, None
@@ -228,7 +229,8 @@ def _map(
     with tqdm(total=len(motions), unit="scan", desc="compiling", mininterval=0.2) as bar:
 
         def watch(mapper: Mapper, part: Part) -> None:
-            bar.set_description("mapping", refresh=False)
+            done = bar.n + len(part.info.finite) == len(motions)
+            bar.set_description("smoothing" if done and how["smooth"] else "mapping", refresh=False)
             found = int(np.sum(slam.confirmed(config, mapper.belief)))
             bar.set_postfix_str(f"{found} landmarks", refresh=False)
             bar.update(len(part.info.finite))

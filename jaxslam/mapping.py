@@ -108,7 +108,7 @@ def pose_graph(config: Config, noise: Noise, survey: Survey, inputs: Inputs) -> 
     turn = np.stack([-seen[:, 1], seen[:, 0]], axis=-1)  # what a radian of bearing moves
     ray = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     from_polar = np.stack([ray, turn], axis=-1)
-    return PoseGraph(
+    graph = PoseGraph(
         poses=survey.poses,
         places=np.asarray(belief.places, np.float64)[np.asarray(kept)],
         motion=np.asarray(motion, np.float64)[1:],
@@ -117,4 +117,12 @@ def pose_graph(config: Config, noise: Noise, survey: Survey, inputs: Inputs) -> 
         which=np.array([rank[name] for name in np.asarray(info.id)[at].tolist()], int),
         seen=seen,
         seen_information=np.linalg.inv(from_polar @ r @ from_polar.transpose(0, 2, 1)),
+    )
+    ties = survey.closures
+    if ties is None:
+        return graph
+    return graph._replace(
+        closed=np.stack([ties.first, ties.second], axis=1),
+        closure=ties.motion,
+        closure_information=ties.information,
     )

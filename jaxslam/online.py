@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import alignment, association, slam, smoother, sparse, topomap
+from jaxslam import alignment, association, closures, slam, smoother, sparse, topomap
 from jaxslam.alignment import Aligned, LocalMap
 from jaxslam.batches import pad
 from jaxslam.belief import Belief, grown
+from jaxslam.closures import Closures
 from jaxslam.covariance import make_room, postpone, settle
 from jaxslam.lidar import Scan
 from jaxslam.links import Links
@@ -31,6 +32,7 @@ from jaxslam.types import Array
 STRETCH = 64  # scans
 ROOM = 384  # slots by which the map of the filter grows
 SPARE = 128  # free ones at the beginning of a stretch, at least
+ROUNDS = 2  # of finding closures, each from the way that the one before left
 LIKE = 512  # scans, or landmarks: runs are smoothed as if they had a multiple of them
 MOST = 2048  # slots, unless told otherwise: what a building of some kilometres of corridor has
 
@@ -60,6 +62,7 @@ class Survey(NamedTuple):
     nodes: Nodes  # [T]
     graph: Graph
     aligned: Aligned | None = None  # [T] motions by scans, where they were aligned
+    closures: Closures | None = None  # that it was smoothed with, where they were
 
 
 class _Seen(NamedTuple):
@@ -121,7 +124,8 @@ def survey(
     """Map a whole drive.
 
     The filter tells each pose by what was seen up to it. If it is to be smoothed, all poses and
-    places are told by all that was seen (`sparse.smooth`).
+    places are told by all that was seen (`sparse.smooth`), and where scans are aligned, those of
+    later visits to a place are laid on those of earlier ones (`closures.find`).
 
     Args:
         config: Of front end and filter; `landmarks` is how many the map may come to hold.
@@ -151,21 +155,28 @@ def survey(
         if watch is not None:
             watch(mapper, part)
     whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    info, poses = whole.info, np.asarray(whole.info.pose, np.float64)
+    info, poses, found = whole.info, np.asarray(whole.info.pose, np.float64), None
     if smooth:
         inputs = Inputs(motions.astype(info.pose.dtype), whole.nodes, aligned=whole.aligned)
-        poses, belief = smoothed(config, noise, start, inputs, info, mapper.belief)
+        given = inputs, info, mapper.belief, scans if aligned else None
+        poses, belief, found = smoothed(config, noise, start, *given)
         mapper = mapper._replace(belief=belief)
     told = graph(config, mapper, poses)
-    return Survey(poses, mapper.belief, info, whole.nodes, told, whole.aligned)
+    return Survey(poses, mapper.belief, info, whole.nodes, told, whole.aligned, found)
 
 
 _records = jax.jit(smoother.records, static_argnames="doubt")
 
 
 def smoothed(
-    config: Config, noise: Noise, start: Array, inputs: Inputs, info: Info, belief: Belief
-) -> tuple[np.ndarray, Belief]:
+    config: Config,
+    noise: Noise,
+    start: Array,
+    inputs: Inputs,
+    info: Info,
+    belief: Belief,
+    scans: Scan | None = None,
+) -> tuple[np.ndarray, Belief, Closures | None]:
     """A filtered drive by all that was seen on it.
 
     Args:
@@ -175,11 +186,17 @@ def smoothed(
         inputs: [T] it was given, NumPy.
         info: [T] what it found, NumPy.
         belief: At the end.
+        scans: [T] to close loops with, NumPy; None to close none but the filter's.
 
     Returns:
-        Poses (T, 3) float64, and the belief with the last of them and the places that go with
-        them; covariances are still the filter's.
+        Poses (T, 3) float64, the belief with the last of them and the places that go with them,
+        whose covariances are still the filter's, and what loops were closed.
+
+    Raises:
+        ValueError: There are scans, and `noise.alignment` is None.
     """
+    if scans is not None and noise.alignment is None:
+        raise ValueError("noise.alignment is None, and there are scans to close loops with")
     steps, room = len(info.pose), lambda count: (count // LIKE + 1) * LIKE
     found = association.landmarks(
         info.id, info.pose, inputs.nodes, size=room(np.count_nonzero(np.unique(info.id) >= 0))
@@ -190,7 +207,11 @@ def smoothed(
     for motion in jax.tree.leaves((inputs.motion, inputs.aligned and inputs.aligned.motion)):
         motion[steps:] = 0.0
     records = _records(noise, start, inputs, which, doubt=config.doubt)
-    track = sparse.smooth(records, guess, found.places)
+    track, closed = sparse.smooth(records, guess, found.places), None
+    for _ in range(0 if scans is None else ROUNDS):
+        how = config.closures, config.alignment, config.lidar, track.poses[:steps], scans
+        closed = closures.find(*how, scale=float(noise.alignment))
+        track = sparse.smooth(records, track.poses, track.places, closures=closed)
     # The names are in order, and no landmark has the name that fills up the end.
     names = np.asarray(found.id)
     names = np.where(names < 0, np.iinfo(names.dtype).max, names)
@@ -199,7 +220,7 @@ def smoothed(
     places = np.where(same[:, None], track.places[at], belief.places)
     poses = track.poses[:steps]
     mean = np.concatenate([poses[-1], places.ravel()])
-    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype))
+    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype)), closed
 
 
 def graph(config: Config, mapper: Mapper, poses: np.ndarray) -> Graph:

@@ -246,6 +246,8 @@ def tell(numbers: Numbers, title: str, out: Path) -> None:
         print(f"  {'NEES / 3, about 1 if consistent':30}{numbers['nees']:9.3f}")
     print(f"  {'landmarks':30}{numbers['landmarks']:10.0f}")
     print(f"  {'matches a scan':30}{numbers['matches']:10.1f}")
+    if numbers.get("closures"):
+        print(f"  {'places met again, by scans':30}{numbers['closures']:10d}")
     _tell_seconds(numbers)
     print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")
 

@@ -14,6 +14,7 @@ from jaxslam import alignment, edges, ekf, junctions, links, nodes, voronoi
 from jaxslam.alignment import Aligned, AlignSpec
 from jaxslam.batches import map_batches
 from jaxslam.belief import Belief, forget, initial, note, worth
+from jaxslam.closures import ClosureSpec
 from jaxslam.conditioning import drop, innovation_cov, log_likelihood
 from jaxslam.edges import RunSpec
 from jaxslam.grid import GridSpec, rasterise, seen_free
@@ -47,6 +48,7 @@ class Config(NamedTuple):
     fresh: int = 8  # new landmarks in one scan at most
     matching: MatchSpec = MatchSpec()
     alignment: AlignSpec = AlignSpec()  # of scans, where odometry is taken from them
+    closures: ClosureSpec = ClosureSpec()  # of loops, where such a drive is smoothed
     doubt: float = 3.0  # factor on the standard deviation of features that are not trusted
     confirm: int = 2  # sightings from which a landmark counts
     wall_confirm: int = 4  # likewise a wall direction: most scans show one, and a wrong one harms

@@ -9,6 +9,8 @@ References:
     iteratively reweighted least-squares.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,9 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from jaxslam import arrow, smoother
+from jaxslam import closures as closing
 from jaxslam.arrow import Rows, State
+from jaxslam.closures import Closures
 from jaxslam.smoother import Records, Track
 from jaxslam.types import Array
 
@@ -43,6 +47,28 @@ def _evaluate(records: Records, state: State, doubt: Array) -> tuple[Array, Stat
     return cost, (slope[0], slope[1] + pull), rows
 
 
+class Ties(NamedTuple):
+    """Reweighted residuals of loop closures, as `Rows` are those of features."""
+
+    at: tuple[np.ndarray, np.ndarray]  # (C,) each, of the two poses
+    residual: np.ndarray  # (C, 3)
+    by_pose: tuple[np.ndarray, np.ndarray]  # (C, 3, 3) each
+
+
+def _doubted(
+    closures: Closures, poses: np.ndarray, slope: np.ndarray, doubt: float
+) -> tuple[float, np.ndarray, Ties]:
+    """Cost of closures, a gradient over two (T, 3) with theirs added, and their rows."""
+    residual, *by_pose = closing.residuals(closures, poses)
+    square = np.sum(residual**2, axis=1)
+    root = 1.0 / np.sqrt(1.0 + square / doubt**2)[:, None]
+    ties = Ties(closures[:2], root * residual, tuple(root[..., None] * by for by in by_pose))
+    slope = np.array(slope)
+    for at, by in zip(ties.at, ties.by_pose, strict=True):
+        np.add.at(slope, at, (by.swapaxes(1, 2) @ ties.residual[..., None])[..., 0])
+    return float(np.sum(doubt**2 * np.log1p(square / doubt**2))), slope, ties
+
+
 Blocks = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Blocks (N, n, m), from rows (N,) and columns (N,) on; as arguments: rows, columns, blocks."""
 
@@ -58,7 +84,7 @@ def _assembled(parts: list[Blocks], shape: tuple[int, int]) -> sparse.csc_array:
     return sparse.csc_array((value, (row, column)), shape=shape)
 
 
-def _matrix(rows: Rows, extra: np.ndarray) -> sparse.csc_array:
+def _matrix(rows: Rows, ties: Ties | None, extra: np.ndarray) -> sparse.csc_array:
     """J^T J, and what is known of landmarks (L, 2, 2).
 
     Places of which nothing is known stay; all else is held by no more than rounding takes.
@@ -73,7 +99,12 @@ def _matrix(rows: Rows, extra: np.ndarray) -> sparse.csc_array:
         (feature, pose[t], rows.by_pose[t, m]),
         (feature, place[rows.at[t, m]], rows.by_place[t, m]),
     ]
-    jacobian = _assembled(parts, (3 * steps + 2 * len(t), size))
+    height = 3 * steps + 2 * len(t)
+    if ties is not None:
+        at = height + 3 * np.arange(len(ties.residual))
+        parts += [(at, 3 * k, by) for k, by in zip(ties.at, ties.by_pose, strict=True)]
+        height += ties.residual.size
+    jacobian = _assembled(parts, (height, size))
     matrix = jacobian.T @ jacobian + _assembled([(place, place, extra)], (size, size))
     known = matrix.diagonal()
     held = np.where(known > 0.0, 4 * np.finfo(float).eps * known, 1.0)
@@ -81,21 +112,28 @@ def _matrix(rows: Rows, extra: np.ndarray) -> sparse.csc_array:
 
 
 def smooth(
-    records: Records, poses: Array, places: Array, *, doubt: float = DOUBT, iterations: int = 50
+    records: Records,
+    poses: Array,
+    places: Array,
+    *,
+    closures: Closures | None = None,
+    doubt: float = DOUBT,
+    iterations: int = 50,
 ) -> Track:
     """Most likely poses and places of one run, from a guess, as `smoother.smooth` finds them.
 
         minimise  sum_t |x_t (-) x_t-1 - u_t|^2_Q + sum_tm rho(|z_tm - h(x_t, l_which)|_R) + prior
 
-    with Cauchy's rho(e) = c^2 log(1 + e^2 / c^2), by Gauss-Newton with these weights, which is
-    ended once the cost hardly falls. Runs on the host. To use one program for runs of many lengths,
-    pad them.
+    with Cauchy's rho(e) = c^2 log(1 + e^2 / c^2), of closures too, by Gauss-Newton with these
+    weights, which is ended once the cost hardly falls. Runs on the host. To use one program for
+    runs of many lengths, pad them.
 
     Args:
         records: What the robot was told; arrays of either precision.
         poses: (T, 3) guess, world frame.
         places: (L, 2) guess.
-        doubt: c [std]; infinite to believe all features.
+        closures: Pairs of poses that scans tie to each other; they are doubted as features are.
+        doubt: c [std]; infinite to believe all.
         iterations: At most.
 
     Returns:
@@ -114,13 +152,20 @@ def smooth(
     limit = np.float64(min(doubt, 1e9))  # from which the logarithm is a square
     with jax.enable_x64(True):
         own = _prepared(records, size)
-        evaluate = lambda state: jax.tree.map(np.asarray, _evaluate(own, state, limit))
+
+        def evaluate(state: State) -> tuple[np.ndarray, State, tuple[Rows, Ties | None]]:
+            cost, slope, rows = jax.tree.map(np.asarray, _evaluate(own, state, limit))
+            if closures is None:
+                return cost, slope, (rows, None)
+            more, by_pose, ties = _doubted(closures, state[0], slope[0], limit)
+            return cost + more, (by_pose, slope[1]), (rows, ties)
+
         cost, slope, rows = evaluate(state)
         costs = [float(cost)]
         for _ in range(iterations if np.isfinite(cost) else 0):
             right = np.concatenate([-np.ravel(x) for x in slope])
             how = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
-            step = splu(_matrix(rows, extra), diag_pivot_thresh=0.0, **how).solve(right)
+            step = splu(_matrix(*rows, extra), diag_pivot_thresh=0.0, **how).solve(right)
             step = step[: state[0].size].reshape(-1, 3), step[state[0].size :].reshape(-1, 2)
             for part in 0.5 ** np.arange(HALVINGS + 1):
                 new = tuple(x + part * dx for x, dx in zip(state, step, strict=True))

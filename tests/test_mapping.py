@@ -7,9 +7,11 @@ from PIL import Image
 from scipy.optimize import least_squares
 
 from jaxslam import lidar, mapping, motion, online, slam, world
+from jaxslam.closures import Closures
 from jaxslam.io import occupancy, posegraph
 from jaxslam.io.errors import InputError
 from jaxslam.lidar import Lidar
+from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 
 LIDAR = Lidar(beams=91, step=np.pi / 90, reach=8.0)
@@ -113,11 +115,14 @@ def root_of(upper, size):
 
 def test_an_optimiser_finds_the_drive_in_its_graph(drive, tmp_path):
     survey, noise, inputs, config, true = drive
+    tie = seen_from(true[2], true[9])[None], 1e4 * np.eye(3)[None]
+    survey = survey._replace(closures=Closures(np.array([2]), np.array([9]), *tie))
     posegraph.write(tmp_path / "graph.g2o", mapping.pose_graph(config, noise, survey, inputs))
     graph = parsed(tmp_path / "graph.g2o")
     poses = {names[0]: np.array(x) for names, x in graph["VERTEX_SE2"]}
     marks = {names[0]: np.array(x) for names, x in graph["VERTEX_XY"]}
-    assert list(poses) == list(range(12)) and len(marks) > 4 and len(graph["EDGE_SE2"]) == 11
+    assert list(poses) == list(range(12)) and len(marks) > 4 and len(graph["EDGE_SE2"]) == 12
+    assert graph["EDGE_SE2"][-1][0] == [2, 9]
     assert len(graph["EDGE_SE2_XY"]) > 30 and graph["FIX"] == [([0], [])]
     order = {name: 3 * 11 + 2 * k for k, name in enumerate(marks)}
 

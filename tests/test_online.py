@@ -3,8 +3,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import alignment, association, lidar, online, slam, smoother, sparse, topomap, world
+from jaxslam import (
+    alignment,
+    association,
+    closures,
+    lidar,
+    online,
+    slam,
+    smoother,
+    sparse,
+    topomap,
+    world,
+)
 from jaxslam.alignment import AlignSpec
+from jaxslam.closures import Closures
 from jaxslam.geometry import unit
 from jaxslam.lidar import Lidar
 from jaxslam.poses import seen_from
@@ -122,6 +134,30 @@ def test_a_smoothed_drive_is_that_of_the_smoother(drive, surveys, monkeypatch):
         np.testing.assert_allclose(found.belief.places[slot], want, atol=1e-8)
         moved += np.abs(want - own).max() > 1e-4
     assert moved > 4
+
+
+def test_a_smoothed_drive_by_scans_is_tied_where_it_met_itself(drive, monkeypatch):
+    monkeypatch.setattr(online, "LIKE", 8)
+    motions, scans = drive
+    plain = online.survey(CONFIG, NOISE, START, motions, scans, aligned=True, smooth=True)
+    assert [len(x) for x in plain.closures] == [0] * 4  # it is too short to have
+    apart = seen_from(plain.poses[1], plain.poses[9])
+    tie = Closures(np.array([1]), np.array([9]), apart[None] + 0.01, 1e8 * np.eye(3)[None])
+    heard = []
+
+    def find(*given, scale):
+        heard.append((*given, scale))
+        return tie
+
+    monkeypatch.setattr(closures, "find", find)
+    found = online.survey(CONFIG, NOISE, START, motions, scans, aligned=True, smooth=True)
+    np.testing.assert_allclose(seen_from(found.poses[1], found.poses[9]), apart + 0.01, atol=1e-4)
+    assert found.closures is tie and len(heard) == online.ROUNDS
+    for poses, given in zip((plain.poses, found.poses), heard, strict=True):
+        np.testing.assert_allclose(given[3], poses, atol=1e-3)
+        assert given[:3] == (CONFIG.closures, CONFIG.alignment, LIDAR)
+        assert given[5] == float(NOISE.alignment)
+        jax.tree.map(np.testing.assert_array_equal, given[4], scans)
 
 
 def test_a_stretch_is_told_when_it_is_done(surveys):

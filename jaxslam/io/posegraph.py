@@ -3,7 +3,8 @@
 VERTEX_SE2 id x y theta                      poses of the scans, 0..T-1
 VERTEX_XY id x y                             landmarks
 FIX 0
-EDGE_SE2 a b x y theta + 6 numbers           motions, with information (upper triangle)
+EDGE_SE2 a b x y theta + 6 numbers           motions, with information (upper triangle); then
+                                             closures, from the earlier pose to the later
 EDGE_SE2_XY a b x y + 3 numbers              landmarks seen, robot frame, likewise
 
 Directions of walls have no form of their own there and are left out.
@@ -30,6 +31,9 @@ class PoseGraph(NamedTuple):
     which: np.ndarray  # (K,) number of the landmark
     seen: np.ndarray  # (K, 2) [m] where, robot frame
     seen_information: np.ndarray  # (K, 2, 2)
+    closed: np.ndarray = np.zeros((0, 2), int)  # (C, 2) numbers of two poses that scans tie
+    closure: np.ndarray = np.zeros((0, 3))  # (C, 3) the second in the frame of the first
+    closure_information: np.ndarray = np.zeros((0, 3, 3))  # (C, 3, 3)
 
 
 def write(path: str | PathLike, graph: PoseGraph) -> None:
@@ -49,8 +53,12 @@ def write(path: str | PathLike, graph: PoseGraph) -> None:
     text = [_line("VERTEX_SE2", (k,), pose) for k, pose in enumerate(graph.poses)]
     text += [_line("VERTEX_XY", (first + k,), place) for k, place in enumerate(graph.places)]
     text.append("FIX 0")
-    for k, (move, sure) in enumerate(zip(graph.motion, graph.motion_information, strict=True)):
-        text.append(_line("EDGE_SE2", (k, k + 1), [*move, *sure[np.triu_indices(3)]]))
+    pairs = [(k, k + 1) for k in range(len(graph.motion))]
+    parts = (pairs, graph.motion, graph.motion_information)
+    closures = (graph.closed.tolist(), graph.closure, graph.closure_information)
+    for ties in (parts, closures):
+        for pair, move, sure in zip(*ties, strict=True):
+            text.append(_line("EDGE_SE2", pair, [*move, *sure[np.triu_indices(3)]]))
     told = zip(graph.seen_by, graph.which, graph.seen, graph.seen_information, strict=True)
     for pose, landmark, place, sure in told:
         values = [*place, *sure[np.triu_indices(2)]]

@@ -72,7 +72,7 @@ def find(
         spec: Which are tried, and believed.
         align: How scans are aligned.
         lidar: The scanner.
-        poses: (T, 3) about right: guesses are off by a metre at most.
+        poses: (T, 3), off by a metre at most where it matters; if not finite, there are none.
         scans: [T].
         scale: Factor on the standard deviation that alignment tells.
     """
@@ -115,9 +115,10 @@ def candidates(
         poses: (T, 3).
         along: (T,) [m] the way to each.
     """
-    later = np.searchsorted(along, np.arange(0.0, along[-1], spec.every))
     pairs = []
-    for k in np.unique(later):
+    if not np.isfinite(poses).all():
+        along = along[:0]
+    for k in np.unique(np.floor(along / spec.every), return_index=True)[1]:
         before = np.searchsorted(along, along[k] - spec.away)
         off = seen_from(poses[k], poses[:before])
         away = np.hypot(off[:, 0], off[:, 1])

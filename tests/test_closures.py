@@ -112,6 +112,16 @@ def test_a_way_that_never_comes_back_has_none(office):
     assert [len(x) for x in found] == [0, 0, 0, 0]
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+def test_a_way_that_is_nonsense_has_none(office, bad):
+    _, poses, scans = office
+    poses = poses.copy()
+    poses[3] = bad
+    found = closures.find(SPEC, ALIGN, LIDAR, poses, scans)
+    assert not len(found.first) or np.isfinite(bad)
+    assert all(np.isfinite(x).all() for x in found)
+
+
 def random_ties(poses, rng):
     """Closures that are a little off, and of a random information each."""
     first, second = np.array([0, 2, 1]), np.array([5, 6, 7])

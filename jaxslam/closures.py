@@ -24,7 +24,7 @@ from jaxslam.batches import pad
 from jaxslam.geometry import rotation, to_world
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.poses import seen_from
-from jaxslam.types import Array
+from jaxslam.types import Array, expect
 
 
 class ClosureSpec(NamedTuple):
@@ -55,6 +55,8 @@ class Closures(NamedTuple):
 
 
 BATCH = 32  # pairs that are laid at a time, by one program
+LIKELY = 0.02  # part explained that a squared standard deviation from the guess outweighs
+FAINT = 1e-4  # of what is known of the guess: it holds only what scans do not show at all
 
 
 def find(
@@ -75,7 +77,12 @@ def find(
         poses: (T, 3), off by a metre at most where it matters; if not finite, there are none.
         scans: [T].
         scale: Factor on the standard deviation that alignment tells.
+
+    Raises:
+        ValueError: Poses or ranges have another shape or type.
     """
+    expect("poses", poses, ("T", 3), jnp.floating)
+    expect("scans.ranges", scans.ranges, (len(poses), lidar.beams), jnp.floating)
     poses, scans = np.asarray(poses, np.float64), jax.tree.map(np.asarray, scans)
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
     first, second = candidates(spec, poses, along)
@@ -189,10 +196,6 @@ def lay(
     good = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
     explained = jnp.where(good & jnp.isfinite(explained), explained, 0.0)
     return jnp.where(good, pose, guess), jnp.where(good, information, 0.0), explained, margin
-
-
-LIKELY = 0.02  # part explained that a squared standard deviation from the guess outweighs
-FAINT = 1e-4  # of what is known of the guess: it holds only what scans do not show at all
 
 
 @partial(jax.jit, static_argnames=("spec", "align", "lidar"))

@@ -122,6 +122,14 @@ def test_a_way_that_is_nonsense_has_none(office, bad):
     assert all(np.isfinite(x).all() for x in found)
 
 
+def test_arguments_that_do_not_fit_are_named(office):
+    true, _, scans = office
+    with pytest.raises(ValueError, match=r"poses is float64 \(96, 2\)"):
+        closures.find(SPEC, ALIGN, LIDAR, true[:, :2], scans)
+    with pytest.raises(ValueError, match=r"scans.ranges is float64 \(96, 181\), not"):
+        closures.find(SPEC, ALIGN, LIDAR, true[1:], scans)
+
+
 def random_ties(poses, rng):
     """Closures that are a little off, and of a random information each."""
     first, second = np.array([0, 2, 1]), np.array([5, 6, 7])

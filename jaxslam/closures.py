@@ -54,7 +54,7 @@ class Closures(NamedTuple):
     information: np.ndarray  # (C, 3, 3) inverse covariance of that, in the same frame
 
 
-BATCH = 32  # pairs that are laid at a time, by one program
+BATCH = 8  # pairs that are laid at a time, by one program
 LIKELY = 0.02  # part explained that a squared standard deviation from the guess outweighs
 FAINT = 1e-4  # of what is known of the guess: it holds only what scans do not show at all
 

@@ -276,7 +276,7 @@ def _back(pair: Array, cell: Array, ids: _Ids, bit: Array) -> tuple[Array, Array
         near = at[..., None] + beside[None, None]
         far = far_at[near]
         good = (own_at[near] == own) & (far // 2 < limit[..., None])
-        # A cell of a branch is worth two steps.
+        # A cell of a branch is worth two steps and a half.
         price = jnp.where(good, far - 6 * (far % 2), jnp.iinfo(far.dtype).max)
         best = jnp.argmin(price, axis=-1, keepdims=True)
         can = jnp.any(good, axis=-1)

@@ -34,15 +34,16 @@ class ClosureSpec(NamedTuple):
     away: float = 15.0  # [m] of the way between two visits, at least
     near: float = 2.0  # [m] between two poses, at most
     turned: float = 0.5  # [m] that a turn of a radian between two poses counts
-    scans: int = 25  # K of the earlier visit
-    apart: float = 0.3  # [m] of the way between these
-    few: int = 3  # every so many of them are what a guess is made with
+    scans: int = 13  # K of the earlier visit
+    apart: float = 0.6  # [m] of the way between these
+    few: int = 2  # every so many of them are what a guess is made with
     aside: float = 0.7  # [m] of the first guesses, to all four sides
     unsure: tuple[float, float] = (1.0, 0.1)  # [m], [rad] of the guess
     explained: float = 0.8  # least part of the points that found a surface
     other: float = 0.3  # [m] from which another place counts as one
     margin: float = 0.05  # by which it must explain less
     floor: tuple[float, float] = (0.02, 0.004)  # [m], [rad] of the earlier visit's own poses
+    tilt: float = 0.1  # [rad] of surfaces, by which a bare wall seems to say where along it one is
 
 
 class Closures(NamedTuple):
@@ -108,6 +109,9 @@ def find(
     good = (explained >= spec.explained) & (margin >= spec.margin)
     floor = np.diag([spec.floor[0], spec.floor[0], spec.floor[1]]) ** 2
     told = information[good] / scale**2
+    pretended = spec.tilt**2 * np.trace(told[:, :2, :2], axis1=1, axis2=2)
+    size, axes = np.linalg.eigh(told - pretended[:, None, None] * np.diag([1.0, 1.0, 0.0]))
+    told = (axes * np.maximum(size, 0.0)[:, None]) @ axes.swapaxes(1, 2)
     told = np.linalg.solve(np.eye(3) + told @ floor, told)  # with the floor added to its inverse
     return Closures(first[good], second[good], motion[good], (told + told.swapaxes(1, 2)) / 2)
 

@@ -32,7 +32,8 @@ from jaxslam.types import Array
 STRETCH = 64  # scans
 ROOM = 384  # slots by which the map of the filter grows
 SPARE = 128  # free ones at the beginning of a stretch, at least
-ROUNDS = 2  # of finding closures, each from the way that the one before left
+ROUNDS = 2  # of finding closures at most, each from the way that the one before left,
+STILL = 0.3  # [m] if it left any pose this far from where it was
 LIKE = 512  # scans, or landmarks: runs are smoothed as if they had a multiple of them
 MOST = 2048  # slots, unless told otherwise: what a building of some kilometres of corridor has
 
@@ -210,8 +211,10 @@ def smoothed(
     track, closed = sparse.smooth(records, guess, found.places), None
     for _ in range(0 if scans is None else ROUNDS):
         how = config.closures, config.alignment, config.lidar, track.poses[:steps], scans
-        closed = closures.find(*how, scale=float(noise.alignment))
-        track = sparse.smooth(records, track.poses, track.places, closures=closed)
+        closed, before = closures.find(*how, scale=float(noise.alignment)), track.poses
+        track = sparse.smooth(records, before, track.places, closures=closed)
+        if np.max(np.abs(track.poses - before)[:, :2]) < STILL:
+            break
     # The names are in order, and no landmark has the name that fills up the end.
     names = np.asarray(found.id)
     names = np.where(names < 0, np.iinfo(names.dtype).max, names)

@@ -70,21 +70,22 @@ def test_two_visits_are_tied_as_they_were(office):
     assert 0.02 < square.mean() / 3 < 1.5
 
 
-def test_along_a_bare_corridor_nothing_is_tied():
-    """Every place there is as good as the next one."""
+@pytest.mark.parametrize("seed", range(3))
+def test_along_a_bare_corridor_nothing_is_tied(seed):
+    """Every place there is as good as the next one; across it, and in heading, they lie right."""
     x = np.arange(0.0, 10.0, 0.5)
     true = np.stack([x, 0.0 * x, 0.0 * x], axis=1)
     true = np.concatenate([true, true[::-1] + [0.0, 0.1, np.pi]])
-    scans = scans_of(CORRIDOR, jnp.asarray(true), LIDAR.noise)
-    spec = SPEC._replace(away=4.0)
-    assert len(closures.find(spec, ALIGN, LIDAR, true, scans).first) == 0
-    sure = spec._replace(margin=-1.0)  # but for that
-    found = closures.find(sure, ALIGN, LIDAR, true, scans)
-    assert len(found.first) >= 2
-    error = seen_from(seen_from(true[found.first], true[found.second]), found.motion)
-    assert np.abs(error[:, 1]).max() < 0.05  # across it they lie right
-    along = np.linalg.inv(found.information)[:, 0, 0] ** 0.5
-    assert along.min() > 3 * np.linalg.inv(found.information)[:, 1, 1].max() ** 0.5
+    scans = scans_of(CORRIDOR, jnp.asarray(true), LIDAR.noise, seed)
+    spec = SPEC._replace(away=4.0, every=0.5)
+    sure = closures.find(spec._replace(margin=-1.0), ALIGN, LIDAR, true, scans, scale=0.3)
+    assert len(sure.first) >= 8  # but for other places, most would do
+    assert len(closures.find(spec, ALIGN, LIDAR, true, scans, scale=0.3).first) <= 7
+    error = seen_from(seen_from(true[sure.first], true[sure.second]), sure.motion)
+    assert np.abs(error[:, 1]).max() < 0.05 and np.abs(error[:, 2]).max() < 0.01
+    assert np.abs(error[:, 0]).max() > 0.2
+    residual = closures.residuals(sure, true)[0]
+    assert np.sum(residual**2, axis=1).max() < 9.0
 
 
 def test_the_other_side_of_a_wall_is_another_wall():

@@ -136,8 +136,11 @@ def test_a_smoothed_drive_is_that_of_the_smoother(drive, surveys, monkeypatch):
     assert moved > 4
 
 
-def test_a_smoothed_drive_by_scans_is_tied_where_it_met_itself(drive, monkeypatch):
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_a_smoothed_drive_by_scans_is_tied_where_it_met_itself(drive, monkeypatch, rounds):
     monkeypatch.setattr(online, "LIKE", 8)
+    if rounds == 2:
+        monkeypatch.setattr(online, "STILL", 0.0)  # as if it had moved far
     motions, scans = drive
     plain = online.survey(CONFIG, NOISE, START, motions, scans, aligned=True, smooth=True)
     assert [len(x) for x in plain.closures] == [0] * 4  # it is too short to have
@@ -152,8 +155,8 @@ def test_a_smoothed_drive_by_scans_is_tied_where_it_met_itself(drive, monkeypatc
     monkeypatch.setattr(closures, "find", find)
     found = online.survey(CONFIG, NOISE, START, motions, scans, aligned=True, smooth=True)
     np.testing.assert_allclose(seen_from(found.poses[1], found.poses[9]), apart + 0.01, atol=1e-4)
-    assert found.closures is tie and len(heard) == online.ROUNDS
-    for poses, given in zip((plain.poses, found.poses), heard, strict=True):
+    assert found.closures is tie and len(heard) == rounds <= online.ROUNDS
+    for poses, given in zip((plain.poses, found.poses), heard, strict=False):
         np.testing.assert_allclose(given[3], poses, atol=1e-3)
         assert given[:3] == (CONFIG.closures, CONFIG.alignment, LIDAR)
         assert given[5] == float(NOISE.alignment)

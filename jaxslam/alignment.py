@@ -121,6 +121,14 @@ def surfaces(scan: Scan, lidar: Lidar) -> Surfaces:
     return Surfaces(foot, normal, gap, scan.hit & (count >= 3.0) & flat)
 
 
+def laid(surfaces: Surfaces, pose: Array) -> Surfaces:
+    """Surfaces of the frame of a pose (3,), in the frame that the pose is in."""
+    turn = rotation(pose[2])
+    return surfaces._replace(
+        points=to_world(pose, surfaces.points), normal=surfaces.normal @ turn.T
+    )
+
+
 def empty(spec: AlignSpec, lidar: Lidar) -> LocalMap:
     """A local map without scans; the odometry starts at zero."""
     size = spec.scans, lidar.beams
@@ -269,8 +277,7 @@ def _joined(spec: AlignSpec, lidar: Lidar, local: LocalMap, scan: Scan, pose: Ar
     far = jnp.hypot(moved[0], moved[1]) > spec.apart[0]
     new = far | (jnp.abs(moved[2]) > spec.apart[1]) | (local.held == 0)
     slot = jnp.where(new, local.held % size, size)
-    own = surfaces(scan, lidar)
-    own = own._replace(points=to_world(pose, own.points), normal=own.normal @ rotation(pose[2]).T)
+    own = laid(surfaces(scan, lidar), pose)
     put = lambda old, x: old.at[slot].set(x, mode="drop")
     return LocalMap(
         jax.tree.map(put, local.surfaces, own),

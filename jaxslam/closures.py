@@ -21,7 +21,6 @@ from jax import lax
 from jaxslam import alignment
 from jaxslam.alignment import AlignSpec, LocalMap
 from jaxslam.batches import pad
-from jaxslam.geometry import rotation, to_world
 from jaxslam.lidar import Lidar, Scan, points
 from jaxslam.poses import seen_from
 from jaxslam.types import Array, expect
@@ -165,11 +164,7 @@ def lay(
         other place that was found.
     """
     surfaces = jax.vmap(partial(alignment.surfaces, lidar=lidar))(visit)
-    turn = jax.vmap(rotation)(around[:, 2])
-    surfaces = surfaces._replace(
-        points=jax.vmap(to_world)(around, surfaces.points),
-        normal=surfaces.normal @ turn.swapaxes(1, 2),
-    )
+    surfaces = jax.vmap(alignment.laid)(surfaces, around)
     local = LocalMap(surfaces, around, jnp.int32(spec.scans), guess)
     few = jax.tree.map(lambda x: x[:: spec.few], (surfaces, around))
     few = local._replace(surfaces=few[0], poses=few[1])

@@ -47,7 +47,7 @@ def _evaluate(records: Records, state: State, doubt: Array) -> tuple[Array, Stat
     return cost, (slope[0], slope[1] + pull), rows
 
 
-class Ties(NamedTuple):
+class _Ties(NamedTuple):
     """Reweighted residuals of loop closures, as `Rows` are those of features."""
 
     at: tuple[np.ndarray, np.ndarray]  # (C,) each, of the two poses
@@ -57,12 +57,12 @@ class Ties(NamedTuple):
 
 def _doubted(
     closures: Closures, poses: np.ndarray, slope: np.ndarray, doubt: float
-) -> tuple[float, np.ndarray, Ties]:
+) -> tuple[float, np.ndarray, _Ties]:
     """Cost of closures, a gradient over two (T, 3) with theirs added, and their rows."""
     residual, *by_pose = closing.residuals(closures, poses)
     square = np.sum(residual**2, axis=1)
     root = 1.0 / np.sqrt(1.0 + square / doubt**2)[:, None]
-    ties = Ties(closures[:2], root * residual, tuple(root[..., None] * by for by in by_pose))
+    ties = _Ties(closures[:2], root * residual, tuple(root[..., None] * by for by in by_pose))
     slope = np.array(slope)
     for at, by in zip(ties.at, ties.by_pose, strict=True):
         np.add.at(slope, at, (by.swapaxes(1, 2) @ ties.residual[..., None])[..., 0])
@@ -84,7 +84,7 @@ def _assembled(parts: list[Blocks], shape: tuple[int, int]) -> sparse.csc_array:
     return sparse.csc_array((value, (row, column)), shape=shape)
 
 
-def _matrix(rows: Rows, ties: Ties | None, extra: np.ndarray) -> sparse.csc_array:
+def _matrix(rows: Rows, ties: _Ties | None, extra: np.ndarray) -> sparse.csc_array:
     """J^T J, and what is known of landmarks (L, 2, 2).
 
     Places of which nothing is known stay; all else is held by no more than rounding takes.
@@ -153,7 +153,7 @@ def smooth(
     with jax.enable_x64(True):
         own = _prepared(records, size)
 
-        def evaluate(state: State) -> tuple[np.ndarray, State, tuple[Rows, Ties | None]]:
+        def evaluate(state: State) -> tuple[np.ndarray, State, tuple[Rows, _Ties | None]]:
             cost, slope, rows = jax.tree.map(np.asarray, _evaluate(own, state, limit))
             if closures is None:
                 return cost, slope, (rows, None)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam import lidar as lidars
+from jaxslam import programs
 from jaxslam.geometry import between, compose, dot, rotation, to_world, wrap_angle
 from jaxslam.lidar import Lidar, Scan
 from jaxslam.linalg import inverse_root
@@ -287,7 +288,7 @@ def _joined(spec: AlignSpec, lidar: Lidar, local: LocalMap, scan: Scan, pose: Ar
     )
 
 
-@partial(jax.jit, static_argnames=("spec", "lidar"))
+@partial(programs.jit, static_argnames=("spec", "lidar"))
 def follow(
     spec: AlignSpec,
     lidar: Lidar,

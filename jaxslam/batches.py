@@ -14,6 +14,7 @@ from jax.custom_batching import custom_vmap
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxslam import programs
 from jaxslam.types import Array
 
 FLAGS = {"--xla_force_host_platform_device_count": "{cores}"}
@@ -131,7 +132,7 @@ class Spread:
         """
         self.size = size
         self._function = function
-        self._compiled = jax.jit(self._run, static_argnums=tuple(range(static)))
+        self._static = static
 
     def __call__(self, *given: Any, devices: Sequence[jax.Device] | None = None) -> Any:
         """Results of the function, as NumPy arrays that lead with the number of items.
@@ -145,7 +146,7 @@ class Spread:
 
     def begin(self, *given: Any, devices: Sequence[jax.Device] | None = None) -> Callable[[], Any]:
         """Start the work, with the arguments of a call, and return what waits for its results."""
-        *fixed, common, items = given
+        fixed, (common, items) = given[: self._static], given[self._static :]
         mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("items",))
         count = jax.tree.leaves(items)[0].shape[0]
         size = min(self.size, -(-count // mesh.size))
@@ -159,17 +160,17 @@ class Spread:
             return jax.device_put(jax.tree.map(lambda x: x[first : first + size], items), device)
 
         shares = [[batch(k, number, device) for number in range(each)] for k, device in own]
+        whole = self._function, *fixed
         lowered = [
-            self._compiled.lower(*fixed, known, share[0])
+            _run.trace(whole, known, share[0]).lower()
             for known, share in zip(common, shares, strict=True)
         ]
         with ThreadPoolExecutor(min(len(own), cores_here())) as pool:
-            programs = list(pool.map(lambda one: one.compile(), lowered))
+            list(pool.map(lambda one: one.compile(), lowered))
         # One batch of every device after the other: none waits for the next.
-        rounds = zip(*shares, strict=True)
         ready = [
-            [program(known, one) for program, known, one in zip(programs, common, now, strict=True)]
-            for now in rounds
+            [_run(whole, known, one) for known, one in zip(common, now, strict=True)]
+            for now in zip(*shares, strict=True)
         ]
 
         def finish() -> Any:
@@ -183,13 +184,15 @@ class Spread:
 
         return finish
 
-    def _run(self, *given: Any) -> Any:
-        *fixed, common, items = given
-        function = partial(self._function, *fixed, common)
-        if jax.tree.leaves(items)[0].shape[0] > 1:
-            return jax.vmap(function)(items)
-        one = function(jax.tree.map(lambda x: x[0], items))
-        return jax.tree.map(lambda x: x[None], one)
+
+@partial(programs.jit, static_argnames="fixed")
+def _run(fixed: tuple, common: Any, items: Any) -> Any:
+    """A function, with its static arguments, of some items; one alone is not vectorised."""
+    function = partial(*fixed, common)
+    if jax.tree.leaves(items)[0].shape[0] > 1:
+        return jax.vmap(function)(items)
+    one = function(jax.tree.map(lambda x: x[0], items))
+    return jax.tree.map(lambda x: x[None], one)
 
 
 def _gather(mesh: Mesh, parts: list[Any]) -> Any:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import alignment
+from jaxslam import alignment, programs
 from jaxslam.alignment import AlignSpec, LocalMap
 from jaxslam.batches import pad
 from jaxslam.lidar import Lidar, Scan, points
@@ -100,7 +100,7 @@ def find(
     parts = []
     for at in range(0, len(first), BATCH):
         some = pad(given(slice(at, at + BATCH)), to=BATCH)
-        parts.append(_lay_all(spec, align, lidar, *jax.tree.map(real, some)))
+        parts.append(_lay_all(spec, align, lidar, jax.tree.map(real, some)))
     if not parts:
         return Closures(first, second, guess, np.zeros((0, 3, 3)))
     found = (np.concatenate(x)[: len(first)].astype(float) for x in zip(*parts, strict=True))
@@ -197,9 +197,9 @@ def lay(
     return jnp.where(good, pose, guess), jnp.where(good, information, 0.0), explained, margin
 
 
-@partial(jax.jit, static_argnames=("spec", "align", "lidar"))
+@partial(programs.jit, static_argnames=("spec", "align", "lidar"))
 def _lay_all(
-    spec: ClosureSpec, align: AlignSpec, lidar: Lidar, *given: Scan | Array
+    spec: ClosureSpec, align: AlignSpec, lidar: Lidar, given: tuple[Scan | Array, ...]
 ) -> tuple[Array, Array, Array, Array]:
     """`lay` of many, one after the other: each stays in the cache."""
     return lax.map(lambda one: lay(spec, align, lidar, *one), given)

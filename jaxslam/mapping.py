@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from jaxslam import slam
+from jaxslam import programs, slam
 from jaxslam.io.occupancy import CELLS, Occupancy
 from jaxslam.io.posegraph import PoseGraph
 from jaxslam.lidar import Lidar, Scan, bearings
@@ -74,7 +74,7 @@ def occupancy(poses: np.ndarray, scans: Scan, lidar: Lidar, *, resolution: float
     return Occupancy(*grids, resolution, np.append(low, 0.0))
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(programs.jit, static_argnames="config")
 def _assumed(config: Config, noise: Noise, inputs: Inputs) -> tuple[Array, Array, Array]:
     """Motions (T, 3), their covariances (T, 3, 3), and those of features (T, M, 2, 2)."""
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import alignment, association, closures, slam, smoother, sparse, topomap
+from jaxslam import alignment, association, closures, programs, slam, smoother, sparse, topomap
 from jaxslam.alignment import Aligned, LocalMap
 from jaxslam.batches import pad
 from jaxslam.belief import Belief, grown
@@ -76,7 +76,7 @@ class _Seen(NamedTuple):
     local: LocalMap | None  # after them
 
 
-@partial(jax.jit, static_argnames=("config", "aligned"))
+@partial(programs.jit, static_argnames=("config", "aligned"))
 def begin(config: Config, start: Array, *, aligned: bool) -> Mapper:
     """A robot at a pose (3,) with an empty map.
 
@@ -166,7 +166,7 @@ def survey(
     return Survey(poses, mapper.belief, info, whole.nodes, told, whole.aligned, found)
 
 
-_records = jax.jit(smoother.records, static_argnames="doubt")
+_records = programs.jit(smoother.records, static_argnames="doubt")
 
 
 def smoothed(
@@ -300,7 +300,7 @@ def _step(
     return (belief, arcs), info
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(programs.jit, static_argnames="config")
 def _steps(
     config: Config, noise: Noise, now: tuple[Belief, Arcs], seen: _Seen
 ) -> tuple[tuple[Belief, Arcs], Info]:

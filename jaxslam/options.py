@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxslam import programs
 from jaxslam.io import noise as noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.slam import Noise
@@ -39,13 +40,14 @@ def noise_of(path: Path | None, default: Noise) -> Noise:
 
 
 def keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told of another one.
+    """Keep programs in the user's cache folder, unless JAX was told of another one.
 
     Garbage is collected less often from here on: while JAX traces, looking for it takes a quarter
     of the time.
     """
     gc.freeze()
     gc.set_threshold(GARBAGE)
+    programs.keep()
     if jax.config.jax_compilation_cache_dir is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxslam import alignment, edges, ekf, junctions, links, nodes, voronoi
+from jaxslam import alignment, edges, ekf, junctions, links, nodes, programs, voronoi
 from jaxslam.alignment import Aligned, AlignSpec
 from jaxslam.batches import map_batches
 from jaxslam.belief import Belief, forget, initial, note, worth
@@ -296,7 +296,7 @@ def run(config: Config, noise: Noise, start: Belief, inputs: Inputs) -> tuple[Be
     return lax.scan(body, start, inputs)
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(programs.jit, static_argnames="config")
 def local_maps(config: Config, scans: Scan) -> tuple[Nodes, Links]:
     """`local_map` of scans that lead with T, a few at a time, which bounds memory."""
     return map_batches(partial(local_map, config), scans, size=BATCH)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from jaxslam import arrow, smoother
+from jaxslam import arrow, programs, smoother
 from jaxslam import closures as closing
 from jaxslam.arrow import Rows, State
 from jaxslam.closures import Closures
@@ -29,11 +29,11 @@ SETTLED = 1e-5  # part of the cost: an iteration that takes less of it is the la
 HALVINGS = 8  # of a step that raises the cost; after these it is not taken
 
 
-_prepared = jax.jit(smoother.prepared, static_argnums=1)
-_wrapped = jax.jit(smoother.wrapped)
+_prepared = programs.jit(smoother.prepared, static_argnames="size")
+_wrapped = programs.jit(smoother.wrapped)
 
 
-@jax.jit
+@programs.jit
 def _evaluate(records: Records, state: State, doubt: Array) -> tuple[Array, State, Rows]:
     """Cost (), its gradient over two, and the rows of the reweighted residuals."""
     cost, (motion, seen), rows, pull = smoother.evaluate(records, state)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import ways
+from jaxslam import programs, ways
 from jaxslam.association import claim_slots
 from jaxslam.belief import Belief
 from jaxslam.geometry import to_robot, to_world, unit
@@ -96,7 +96,7 @@ def attach(line: Array, first: Array, last: Array) -> Array:
     return first[..., None, :] + turned + part.reshape((1,) * (line.ndim - 2) + part.shape) * rest
 
 
-_attach = jax.jit(attach)
+_attach = programs.jit(attach)
 
 
 def _explored(arcs: Arcs, pose: Array, scan: Scan, lidar: Lidar) -> Array:

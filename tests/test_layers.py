@@ -9,11 +9,11 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 ORDER = (
-    "types poses linalg batches geometry world motion lidar grid voronoi tiles lines edges "
-    "global_edges circles nodes sensor noise junctions links alignment closures association "
+    "types poses linalg programs batches geometry world motion lidar grid voronoi tiles lines "
+    "edges global_edges circles nodes sensor noise junctions links alignment closures association "
     "covariance belief conditioning ekf recognition arrow ways topomap medial skeleton slam "
-    "smoother sparse online plan metrics monte_carlo losses descent fit curvature io logs "
-    "mapping plot report options tuning film view cli"
+    "smoother sparse online plan metrics monte_carlo losses descent fit curvature io logs mapping "
+    "plot report options tuning film view cli"
 ).split()
 DOORS = {"__init__", "__main__"}  # may import everything
 FILES = sorted(HOME.rglob("*.py"))

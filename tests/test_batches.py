@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam import batches
 from jaxslam.batches import Spread, map_batches, one_by_one, pad
 
 
@@ -79,8 +80,7 @@ def test_what_is_one_at_a_time_is_not_vectorised():
     """A decision of one item stays one: of a batch, both sides would be done."""
     decide = lambda common, item: jax.lax.cond(item > 0, lambda: common, lambda: -common)
     for size, word in [(1, "cond"), (2, "select")]:
-        spread = Spread(decide, size=size)
-        run = spread._compiled.trace(jnp.float64(1.0), jnp.arange(size)).jaxpr
+        run = batches._run.trace((decide,), jnp.float64(1.0), jnp.arange(size)).jaxpr
         assert word in str(run)
     assert Spread(decide, size=1)(jnp.float64(2.0), jnp.array([1, 0, 3])).tolist() == [2, -2, 2]
 

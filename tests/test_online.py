@@ -194,12 +194,16 @@ def test_motions_by_scans_alone_are_those_of_the_whole_survey(drive, surveys):
     close(online.align(CONFIG, scans, motions), surveys[True][0].aligned)
 
 
-def test_a_log_of_another_length_needs_no_other_program(drive, surveys):
-    motions, scans = _numpy(drive)
-    size = slam.local_maps._cache_size(), online._steps._cache_size()
-    some = jax.tree.map(lambda x: x[:6], scans)
-    online.survey(CONFIG, NOISE, START, motions[:6], some, aligned=True)
-    assert (slam.local_maps._cache_size(), online._steps._cache_size()) == size
+def test_a_log_of_another_length_needs_no_other_program(drive, surveys, caplog):
+    motions, scans = jax.tree.map(lambda x: x[:6], _numpy(drive))
+    jax.config.update("jax_log_compiles", True)  # of all threads
+    try:
+        online.survey(CONFIG, NOISE, START, motions, scans, aligned=True)
+        slam.local_maps(CONFIG, jax.tree.map(lambda x: jnp.asarray(x[:1]), scans))
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    assert caplog.text.count("Compiling jit(local_maps)") == 1  # of one scan
+    assert "Compiling jit(_steps)" not in caplog.text
 
 
 def test_a_room_of_six_walls_has_three_wall_directions(monkeypatch):

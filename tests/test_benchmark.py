@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import benchmark, estimator, filters, peers, workload
+from experiments import benchmark, common, estimator, filters, peers, start, workload
 from jaxslam import slam
+from jaxslam.io import readers
 from jaxslam.lidar import Scan
 from jaxslam.motion import Robot
 from jaxslam.voronoi import expand
@@ -126,3 +127,25 @@ def test_neither_filter_nor_gradient_calls_lapack():
 def test_a_call_of_lapack_would_be_found(name):
     traced = jax.jit(getattr(jnp.linalg, name)).trace(jnp.eye(2))
     assert re.search(LAPACK, str(traced.jaxpr)) and "lapack" in traced.lower().as_text()
+
+
+def test_a_start_is_timed_until_the_bar_says_that_scans_are_mapped(tmp_path):
+    wait = "import sys, time; time.sleep(0.3); "
+    code = f"{wait}print('mapping', file=sys.stderr, flush=True); {wait}"
+    told = start.start(tmp_path / "log", tmp_path, code)
+    assert 0.3 <= told["mapped_s"] <= told["written_s"] - 0.3
+    for bad in (f"{wait}raise SystemExit('no log')", "print('nothing')"):
+        with pytest.raises(SystemExit, match="log: .*"):
+            start.start(tmp_path / "log", tmp_path, bad)
+    kinds = {kind: told for kind in ("first", "later", "traced_anew")}
+    start.draw({"log": "log", "starts": kinds}, tmp_path / "start.png")
+    assert (tmp_path / "start.png").stat().st_size > 1000
+
+
+def test_the_log_that_is_started_with_is_the_office_drive(tmp_path):
+    start.simulated(0, tmp_path / "office.npz")
+    log = readers.read(tmp_path / "office.npz")
+    steps = common.scene()[3]
+    assert log.ranges.shape == (steps, slam.Config().lidar.beams)
+    assert np.isfinite(log.ranges).mean() > 0.9 and log.skipped == 0
+    assert 70.0 < np.hypot(*np.diff(log.odometry[:, :2], axis=0).T).sum() < 90.0

@@ -137,7 +137,8 @@ def _put(x: Any, device: jax.Device) -> Any:
     """An argument, or its shape, on a device and nowhere else, as results of such programs are."""
     if isinstance(x, jax.ShapeDtypeStruct):
         return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device))
-    return jax.device_put(x, device)
+    there = isinstance(x, jax.Array) and x.committed
+    return x if there else jax.device_put(x, device)
 
 
 def _told(static: Any) -> str | None:

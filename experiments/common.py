@@ -1,7 +1,6 @@
 """What every experiment shares: its arguments, its two files, and pictures of cells."""
 
 import argparse
-import hashlib
 import json
 import shutil
 import sys
@@ -14,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxslam
-from jaxslam import slam, voronoi, world
+from jaxslam import programs, slam, voronoi, world
 from jaxslam.grid import GridSpec, centres
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import plain, write_json
@@ -87,7 +85,7 @@ class Kept:
     def __init__(self, folder: Path, about: Any):
         """Keep parts in `folder`; those of another program, or `about` something else, are not."""
         self._folder = folder
-        self._about = f"{about!r}, {program()}"
+        self._about = f"{about!r}, {programs.version()}"
 
     def __call__(self, name: str, make: Callable[[], Numbers]) -> Numbers:
         """What `make` returns, as JSON has it: made now, or by an earlier call."""
@@ -107,14 +105,6 @@ class Kept:
     def clear(self) -> None:
         """Remove all of it."""
         shutil.rmtree(self._folder, ignore_errors=True)
-
-
-def program() -> str:
-    """What tells the library's program from others: a number that depends on all of its text."""
-    text = hashlib.sha256(jax.__version__.encode())
-    for file in sorted(Path(jaxslam.__file__).parent.rglob("*.py")):
-        text.update(file.read_bytes())
-    return text.hexdigest()[:16]
 
 
 def save(out: Path, name: str, numbers: Numbers, draw: Callable[[Numbers, Path], None]) -> None:

@@ -31,7 +31,7 @@ from tqdm import tqdm
 from experiments import common, processes, scaling
 from experiments.estimator import peak
 from experiments.monte_carlo_picture import SHOWN, draw
-from jaxslam import metrics, monte_carlo, plan, slam, world
+from jaxslam import metrics, monte_carlo, plan, programs, slam, world
 from jaxslam.batches import use_cores
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
@@ -161,7 +161,7 @@ def summary(key: Any, tracks: Track) -> common.Numbers:
 
 def fingerprint(case: Case, noise: slam.Noise) -> str:
     """What must be the same for runs to be of one experiment: the case and the program."""
-    text = hashlib.sha256(repr((case._replace(walls=0, path=0), common.program())).encode())
+    text = hashlib.sha256(repr((case._replace(walls=0, path=0), programs.version())).encode())
     for x in (case.walls, case.path, *jax.tree.leaves(noise)):
         text.update(np.asarray(x, float).tobytes())
     return f"{case.seed}, {text.hexdigest()[:16]}"

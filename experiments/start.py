@@ -19,7 +19,6 @@ from experiments.common import Numbers
 from jaxslam import monte_carlo, slam
 from jaxslam.io import npz
 from jaxslam.io.recording import Recording
-from jaxslam.lidar import cast, disturb
 
 USUAL = "from jaxslam.cli import main; raise SystemExit(main())"
 ANEW = f"from jaxslam import programs; programs.keep = lambda: None; {USUAL}"
@@ -29,16 +28,12 @@ MAPPED = b"mapping"  # of the bar, from the first stretch of scans on
 def simulated(seed: int, path: Path) -> None:
     """A log of the office drive."""
     place, robot, way, steps = common.scene()
-    lidar = slam.Config().lidar
-    drive_key, scan_key = jax.random.split(jax.random.key(seed))
-    truth, told = monte_carlo.drive(drive_key, robot, way, steps=steps)
-    keys = jax.random.split(scan_key, steps)
-    look = lambda now: disturb(now[0], cast(place, now[1], lidar), lidar)
-    scans = jax.lax.map(look, (keys, truth))
+    given = jax.random.key(seed), slam.Config(), place, robot, way
+    truth, told, scans = monte_carlo.simulate_scans(*given, steps=steps)
     ranges = np.where(scans.hit, scans.ranges, np.inf).astype(np.float32)
     times = np.arange(steps, dtype=float)
     poses = np.asarray(monte_carlo.dead_reckoning(truth[0], told), float)
-    npz.write(path, Recording(times, poses, ranges, lidar, 0, times, poses))
+    npz.write(path, Recording(times, poses, ranges, slam.Config().lidar, 0, times, poses))
 
 
 def start(log: Path, folder: Path, code: str) -> Numbers:
@@ -46,8 +41,9 @@ def start(log: Path, folder: Path, code: str) -> Numbers:
     env = {name: x for name, x in os.environ.items() if not name.startswith("JAX_")}
     env |= {"XDG_CACHE_HOME": str(folder)}
     command = [sys.executable, "-c", code, "run", str(log), "--out", str(folder / "out")]
+    outputs = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     begin, first, seen = perf_counter(), None, b""
-    with subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL, stderr=-1) as process:
+    with subprocess.Popen(command, env=env, **outputs) as process:
         while some := os.read(process.stderr.fileno(), 1 << 16):
             seen += some
             if first is None and MAPPED in seen:

@@ -107,6 +107,14 @@ def simulate_one(
     return Log(truth=truth, motion=told, nodes=seen)
 
 
+def simulate_scans(
+    key: Key, config: Config, world: World, robot: Robot, path: Array, *, steps: int
+) -> tuple[Array, Array, Scan]:
+    """True poses (T, 3), odometry (T, 3) and scans [T] of the drive of `simulate_one`."""
+    truth, told, scan_keys = _drive(key, robot, path, steps=steps)
+    return truth, told, lax.map(lambda now: _scan(config, world, *now), (truth, scan_keys))
+
+
 def _drive(key: Key, robot: Robot, path: Array, *, steps: int) -> tuple[Array, Array, Key]:
     drive_key, scan_key = jax.random.split(key)
     return *drive(drive_key, robot, path, steps=steps), jax.random.split(scan_key, steps)
@@ -130,12 +138,8 @@ def replay(
     """Simulate one run of an experiment again and map it: its true poses (T, 3) and its survey."""
     own = run_keys(key, jnp.array([run]))[0]
 
-    @jax.jit
-    def simulate_scans(own: Key) -> tuple[Array, Array, Scan]:
-        truth, told, scan_keys = _drive(own, robot, path, steps=steps)
-        return truth, told, lax.map(lambda now: _scan(config, world, *now), (truth, scan_keys))
-
-    truth, told, scans = simulate_scans(own)
+    alone = lambda own: simulate_scans(own, config, world, robot, path, steps=steps)
+    truth, told, scans = jax.jit(alone)(own)
     return truth, online.survey(config, noise, truth[0], told, scans)
 
 

@@ -90,7 +90,7 @@ class Jitted:
 
     def _program(self, folder: Path, text: str, static: dict, shapes: dict) -> Callable:
         """What was traced for such arguments, by this process or one before."""
-        name = hashlib.sha256(f"{_versions()} {text}".encode()).hexdigest()
+        name = hashlib.sha256(f"{version()} {text}".encode()).hexdigest()
         path = folder / f"{PACKAGE}-{self._function.__name__}-{name}"
         _know_records()
         exported = _read(path)
@@ -155,8 +155,8 @@ def _told(static: Any) -> str | None:
 
 
 @cache
-def _versions() -> str:
-    """What tracing gives depends on: JAX, and the sources of this package."""
+def version() -> str:
+    """What tells this package's programs from others: a digest of its sources, and of JAX."""
     digest = hashlib.sha256(f"{jax.__version__} {jax.lib.__version__}".encode())
     home = Path(__file__).parent
     for path in sorted(home.rglob("*.py")):

@@ -71,7 +71,7 @@ def test_two_visits_are_tied_as_they_were(office):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_along_a_bare_corridor_nothing_is_tied(seed):
+def test_along_a_bare_corridor_little_is_tied_and_nothing_wrongly(seed):
     """Every place there is as good as the next one; across it, and in heading, they lie right."""
     x = np.arange(0.0, 10.0, 0.5)
     true = np.stack([x, 0.0 * x, 0.0 * x], axis=1)

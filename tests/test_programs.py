@@ -76,7 +76,7 @@ def test_something_else_is_traced_anew(kept, monkeypatch, what):
     config = CONFIG._replace(landmarks=6) if what == "static" else CONFIG
     pose = {"shape": POSE[:2], "type": np.float32(POSE)}.get(what, POSE)
     if what == "sources":
-        monkeypatch.setattr(programs, "_versions", lambda: "others")
+        monkeypatch.setattr(programs, "version", lambda: "others")
     setting = {
         "setting": lambda: jax.default_matmul_precision("highest"),
         "precision": lambda: jax.enable_x64(False),
@@ -147,8 +147,8 @@ def test_bits_of_many_are_those_of_programs_not_kept(kept, monkeypatch):
 
 
 CODE = """
-import sys, jax, jax.numpy as jnp
-from jaxslam import alignment, online, programs, slam
+import jax, jax.numpy as jnp
+from jaxslam import online, programs, slam
 traced = []
 def listen(event, duration, **about):
     if event.endswith("jaxpr_trace_duration"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import common, exact, recovery, search, tuning
-from jaxslam import curvature, fit
+from jaxslam import curvature, fit, programs
 from jaxslam.noise import sighting_noise
 
 HAND = sighting_noise()
@@ -146,7 +146,7 @@ def test_parts_are_kept_until_the_program_or_the_arguments_change(tmp_path, monk
     (file,) = (tmp_path / "kept").iterdir()
     file.write_text("{")
     common.Kept(tmp_path / "kept", {"seed": 1})("one part", make)
-    monkeypatch.setattr(common, "program", lambda: "another")
+    monkeypatch.setattr(programs, "version", lambda: "another")
     common.Kept(tmp_path / "kept", {"seed": 1})("one part", make)
     assert len(made) == 4
     kept.clear()

@@ -1,4 +1,4 @@
-"""`python -m jaxslam`: the command line."""
+"""`python -m jaxslam`: the command line interface."""
 
 import sys
 

@@ -1,14 +1,28 @@
-"""Odometry from scans: each is aligned to the local map of the last ones, beginning at the wheels.
+"""Scan matching: odometry from laser scans by point-to-line ICP against a sliding local map.
 
-The local map holds the points of the last scans, with the normals of the surfaces they lie on. A
-scan is laid where its points lie on those surfaces (point to line), from several first guesses of
-its heading, as wheels slip when a robot turns. What the scans do not show, such as the way along a
-bare corridor, stays as the wheels say: the information that comes with each motion is that of the
-scans alone, and `fuse` puts the two together.
+The local map holds the points of the last keyframe scans, with the normals of the surfaces they
+lie on. A scan is registered where its points lie on these surfaces. ICP starts from several
+headings around that of the odometry, as wheels slip most where a robot turns. The odometry is also
+a weak prior, which keeps directions that the scans do not constrain, such as along a bare corridor.
+The information returned with each increment is that of the scans alone; `fuse` combines both.
+
+Point-to-line ICP. With R = R(heading) and t the position of a pose, a scan point p has the world
+position q = R p + t. Its correspondence on scan k of the map, if it has one, is the surface point
+s with unit normal n nearest to q among the beams around its bearing. Then
+
+    e     = n^T (q - s)                                    residual: distance to the line
+    de    = [n_x, n_y, n_y (R p)_x - n_x (R p)_y] dpose    its derivative, a row J
+    w     = share / (1 + (e / kernel)^2)^2                 Geman-McClure weight
+    H     = sum w J^T J / noise^2                          information of the scan
+    dpose = (H + H_odom)^-1 (-sum w J^T e / noise^2 + H_odom (pose_odom - pose))
+
+where the sums run over all points and scans of the map, and `share` is one over the number of
+correspondences of the point, so that each point counts once. H_odom is the odometry's information.
 
 References:
     Censi (2008), An ICP variant using a point-to-line metric. Olson (2009), Real-time correlative
-    scan matching: why several guesses are worth their time.
+    scan matching: a search over headings. Geman, McClure (1987), Statistical methods for
+    tomographic image reconstruction: the kernel.
 """
 
 from functools import partial
@@ -25,105 +39,155 @@ from jaxslam.lidar import Lidar, Scan
 from jaxslam.linalg import inverse_root
 from jaxslam.types import Array
 
+NEIGHBOURS = 3  # beams on either side that a normal is fitted to
+JOINED = (0.06, 0.1)  # [m], and fraction of the range: larger gaps separate two surfaces
+NOWHERE = 1e6  # [m] coordinates of points that must not become correspondences
+FLAT = 0.04  # largest variance across a surface, as a fraction of that along it
+LIKELY = 0.005  # inlier fraction that a heading 1 std off the odometry must have in addition
+FLOOR = (0.01, 0.005)  # [m], [rad] least std of odometry where it is fused with scans
+
 
 class AlignSpec(NamedTuple):
-    """How scans are aligned; static under jit."""
+    """Options of scan matching; static under jit.
 
-    scans: int = 25  # K of the local map
-    apart: tuple[float, float] = (0.1, 0.1)  # [m], [rad] from the last that joined it to the next
-    beams: int = 180  # of a scan that are aligned at most, evenly taken
-    reach: int = 3  # beams on either side of a point's own in which its partner is looked for
-    turns: tuple[float, ...] = (0.0, 0.15, -0.15, 0.3, -0.3)  # [rad] of the first guesses
-    recent: int = 6  # scans of the local map that a guess is made with
-    thin: int = 4  # and every so many beams
-    far: tuple[float, ...] = (0.8, 0.7, 0.6, 0.5, 0.4)  # [m] to a partner, round by round: a guess
-    near: tuple[float, ...] = (0.4, 0.25, 0.15)  # and the result
-    kernel: tuple[float, float] = (0.1, 0.05)  # [m] residual that counts a quarter, likewise
-    inner: int = 3  # steps of Gauss-Newton with the same partners
-    noise: float = 0.1  # [m] of a point off its line: much more than a range's, as errors go along
-    floor: tuple[float, float] = (0.05, 0.1)  # [m], [rad] of the wheels, for the alignment
-    slip: tuple[float, float] = (0.1, 1.0)  # parts of the way and of the turn, likewise
+    Attributes:
+        scans: K, keyframes of the local map.
+        apart: [m], [rad] motion since the last keyframe from which a scan becomes the next one.
+        beams: Points of a scan that are matched at most, evenly spaced.
+        reach: Beams on either side of a point's own beam that are searched for its correspondence.
+        turns: [rad] offsets of the initial headings from that of the odometry.
+        recent: Keyframes that the coarse search matches against.
+        thin: Every how many points the coarse search uses one.
+        far: [m] largest distance of a correspondence, iteration by iteration, in the coarse search.
+        near: [m] the same in the refinement.
+        kernel: [m] residual at which the weight is one quarter, in coarse search and refinement.
+        inner: Gauss-Newton steps between two searches for correspondences.
+        noise: [m] std of a point's distance to its line. Much larger than that of a range, as the
+            errors of neighbouring points are correlated.
+        floor: [m], [rad] least std of the odometry prior.
+        slip: Std of the odometry prior as fractions of distance and of turn.
+    """
+
+    scans: int = 25
+    apart: tuple[float, float] = (0.1, 0.1)
+    beams: int = 180
+    reach: int = 3
+    turns: tuple[float, ...] = (0.0, 0.15, -0.15, 0.3, -0.3)
+    recent: int = 6
+    thin: int = 4
+    far: tuple[float, ...] = (0.8, 0.7, 0.6, 0.5, 0.4)
+    near: tuple[float, ...] = (0.4, 0.25, 0.15)
+    kernel: tuple[float, float] = (0.1, 0.05)
+    inner: int = 3
+    noise: float = 0.1
+    floor: tuple[float, float] = (0.05, 0.1)
+    slip: tuple[float, float] = (0.1, 1.0)
 
 
 class Surfaces(NamedTuple):
-    """Points of a scan on the surfaces they belong to, in some frame."""
+    """Oriented points: points of a scan with the normals of their surfaces, in some frame.
 
-    points: Array  # (R, 2) [m] on the line through its neighbours
-    normal: Array  # (R, 2) of that line, either way
-    gap: Array  # (R,) [m] to the further of the two neighbours on the surface
-    valid: Array  # (R,) bool
+    Attributes:
+        points: (R, 2) [m] on the line fitted to the point and its neighbours.
+        normal: (R, 2) unit normal of that line, of either sign.
+        gap: (R,) [m] to the further of the two adjacent points on the surface.
+        valid: (R,) bool.
+    """
+
+    points: Array
+    normal: Array
+    gap: Array
+    valid: Array
 
 
 class LocalMap(NamedTuple):
-    """The last scans where they were made, in the frame of the scan odometry."""
+    """Ring buffer of the last K keyframes, in the odometry frame of the scan matcher.
 
-    surfaces: Surfaces  # [K]
-    poses: Array  # (K, 3)
-    held: Array  # () int32 scans that have ever joined; they take turns
-    pose: Array  # (3,) of the last scan
+    Attributes:
+        surfaces: [K] oriented points, in the odometry frame.
+        poses: (K, 3) of the keyframes.
+        held: () int32 keyframes ever added; number n is in slot n modulo K.
+        pose: (3,) of the last scan, keyframe or not.
+    """
+
+    surfaces: Surfaces
+    poses: Array
+    held: Array
+    pose: Array
 
 
 class Aligned(NamedTuple):
-    """What scans tell of a motion, in the frame of the pose before."""
+    """Result of scan matching: an odometry increment in the frame of the pose before.
 
-    motion: Array  # (3,) [m, m, rad]
-    information: Array  # (3, 3) inverse covariance; zero in directions that they do not show
-    explained: Array  # () part of the points that found a surface
+    Attributes:
+        motion: (3,) [m, m, rad].
+        information: (3, 3) inverse covariance, from the scan alone; zero in directions that it does
+            not constrain.
+        explained: () inlier fraction: part of the points that lie on a surface of the map.
+    """
+
+    motion: Array
+    information: Array
+    explained: Array
 
 
-class _Pairs(NamedTuple):
-    """Partners of N points on K scans."""
+class _Correspondences(NamedTuple):
+    """Lines that N points correspond to, on each of K scans.
 
-    normal: Array  # (K, N, 2)
-    offset: Array  # (K, N) [m] of the line along its normal
-    share: Array  # (K, N) what each weighs: a point weighs 1 in all; 0 for none
+    Attributes:
+        normal: (K, N, 2) unit normal n.
+        offset: (K, N) [m] n^T s.
+        share: (K, N) weight of the correspondence, 1 in total for a point that has any; 0 for none.
+    """
 
-
-NEIGHBOURS = 3  # on either side, whose line gives the normal
-JOINED = (0.06, 0.1)  # [m], and part of the range: neighbours further apart are on two surfaces
-NOWHERE = 1e6  # [m] where points are put that are no partners
-FLAT = 0.04  # most variance across a surface, as part of that along it
+    normal: Array
+    offset: Array
+    share: Array
 
 
 def surfaces(scan: Scan, lidar: Lidar) -> Surfaces:
-    """Surfaces of one scan, robot frame.
+    """Oriented points of one scan, robot frame.
 
-    A point's line is that of least squares through its neighbours up to the first gap.
+    The line of a point is the least-squares fit to itself and its neighbours up to the first gap.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
     """
     own = lidars.points(scan, lidar)
     index = jnp.arange(lidar.beams)
-    near, weight, gap = [own], [scan.hit], jnp.zeros(lidar.beams)
+    neighbours, weight, gap = [own], [scan.hit], jnp.zeros(lidar.beams)
     limit = JOINED[0] + JOINED[1] * scan.ranges
     for side in (1, -1):
-        joined, before = scan.hit, own
+        joined, previous = scan.hit, own
         for k in range(1, NEIGHBOURS + 1):
-            at = index + side * k
-            inside = (at >= 0) & (at < lidar.beams)
-            at = jnp.clip(at, 0, lidar.beams - 1)
-            apart = jnp.linalg.norm(own[at] - before, axis=-1)
-            joined = joined & inside & scan.hit[at] & (apart < limit)
-            before = own[at]
-            near.append(before)
+            beam = index + side * k
+            inside = (beam >= 0) & (beam < lidar.beams)
+            beam = jnp.clip(beam, 0, lidar.beams - 1)
+            distance = jnp.linalg.norm(own[beam] - previous, axis=-1)
+            joined = joined & inside & scan.hit[beam] & (distance < limit)
+            previous = own[beam]
+            neighbours.append(previous)
             weight.append(joined)
-            gap = jnp.where(joined & (k == 1), jnp.maximum(gap, apart), gap)
-    near, weight = jnp.stack(near), jnp.stack(weight).astype(own.dtype)
+            gap = jnp.where(joined & (k == 1), jnp.maximum(gap, distance), gap)
+    neighbours, weight = jnp.stack(neighbours), jnp.stack(weight).astype(own.dtype)
     count = jnp.maximum(weight.sum(axis=0), 1.0)
-    centre = jnp.sum(weight[..., None] * near, axis=0) / count[:, None]
-    off = near - centre[None]
+    centre = jnp.sum(weight[..., None] * neighbours, axis=0) / count[:, None]
+    offset = neighbours - centre[None]
     xx, xy, yy = (
-        jnp.sum(weight * off[..., i] * off[..., j], axis=0) / count
+        jnp.sum(weight * offset[..., i] * offset[..., j], axis=0) / count
         for i, j in ((0, 0), (0, 1), (1, 1))
     )
-    along = 0.5 * jnp.arctan2(2 * xy, xx - yy)
-    normal = jnp.stack([-jnp.sin(along), jnp.cos(along)], axis=-1)
+    # Eigenvalues of the scatter matrix are mean +- spread; the line is along the larger one.
+    direction = 0.5 * jnp.arctan2(2 * xy, xx - yy)
+    normal = jnp.stack([-jnp.sin(direction), jnp.cos(direction)], axis=-1)
     spread, mean = jnp.hypot(xx - yy, 2 * xy) / 2, (xx + yy) / 2
     flat = mean - spread < FLAT * (mean + spread)
-    foot = own - dot(own - centre, normal)[:, None] * normal
-    return Surfaces(foot, normal, gap, scan.hit & (count >= 3.0) & flat)
+    projected = own - dot(own - centre, normal)[:, None] * normal
+    return Surfaces(projected, normal, gap, scan.hit & (count >= 3.0) & flat)
 
 
 def laid(surfaces: Surfaces, pose: Array) -> Surfaces:
-    """Surfaces of the frame of a pose (3,), in the frame that the pose is in."""
+    """Oriented points of the frame of a pose (3,), in the frame that the pose is given in."""
     turn = rotation(pose[2])
     return surfaces._replace(
         points=to_world(pose, surfaces.points), normal=surfaces.normal @ turn.T
@@ -131,7 +195,7 @@ def laid(surfaces: Surfaces, pose: Array) -> Surfaces:
 
 
 def empty(spec: AlignSpec, lidar: Lidar) -> LocalMap:
-    """A local map without scans; the odometry starts at zero."""
+    """A local map without keyframes; the odometry starts at zero."""
     size = spec.scans, lidar.beams
     nothing = Surfaces(
         jnp.zeros((*size, 2)), jnp.zeros((*size, 2)), jnp.zeros(size), jnp.zeros(size, bool)
@@ -139,53 +203,63 @@ def empty(spec: AlignSpec, lidar: Lidar) -> LocalMap:
     return LocalMap(nothing, jnp.zeros((spec.scans, 3)), jnp.int32(0), jnp.zeros(3))
 
 
-def _partners(
+def _correspondences(
     spec: AlignSpec, lidar: Lidar, local: LocalMap, points: Array, hit: Array, far: Array
-) -> _Pairs:
-    """Partners of points (N, 2), frame of the map, within a distance: the nearest in each scan."""
+) -> _Correspondences:
+    """Correspondences of points (N, 2), frame of the map: the nearest in each scan, if near enough.
+
+    The search is projective: a point is transformed to the robot frame of the keyframe, its bearing
+    gives a beam, and only the beams within `spec.reach` of that are compared. `far` () [m] limits
+    the distances across and along the line; along it, the gap between two beams is allowed too.
+    """
     middle = lidar.first + lidar.step * (lidar.beams - 1) / 2
     # Column by column, as pairs of numbers are gathered slowly.
     columns = jnp.where(local.surfaces.valid[..., None], local.surfaces.points, NOWHERE)
     columns = columns.swapaxes(1, 2)
 
-    def of(surface: Surfaces, column: Array, pose: Array) -> tuple[Array, Array, Array]:
-        (x, y), (u, v) = points.T, column
+    def on_keyframe(surface: Surfaces, column: Array, pose: Array) -> tuple[Array, Array, Array]:
+        (x, y), (surface_x, surface_y) = points.T, column
         bearing = wrap_angle(jnp.arctan2(y - pose[1], x - pose[0]) - pose[2] - middle)
-        own = jnp.round(bearing / lidar.step + (lidar.beams - 1) / 2).astype(jnp.int32)
-        best, at = jnp.full(hit.shape, jnp.inf, points.dtype), jnp.zeros_like(own)
+        own_beam = jnp.round(bearing / lidar.step + (lidar.beams - 1) / 2).astype(jnp.int32)
+        least = jnp.full(hit.shape, jnp.inf, points.dtype)  # squared distance
+        nearest = jnp.zeros_like(own_beam)
         for k in range(-spec.reach, spec.reach + 1):
-            beam = jnp.clip(own + k, 0, lidar.beams - 1)
-            square = (x - u[beam]) ** 2 + (y - v[beam]) ** 2
-            at, best = jnp.where(square < best, beam, at), jnp.minimum(square, best)
-        normal = surface.normal[at]
-        offset = dot(normal, surface.points[at])
+            beam = jnp.clip(own_beam + k, 0, lidar.beams - 1)
+            square = (x - surface_x[beam]) ** 2 + (y - surface_y[beam]) ** 2
+            nearest, least = jnp.where(square < least, beam, nearest), jnp.minimum(square, least)
+        normal = surface.normal[nearest]
+        offset = dot(normal, surface.points[nearest])
         across = dot(normal, points) - offset
-        limit = jnp.maximum(far, surface.gap[at])
-        near = (jnp.abs(across) < far) & (best - across**2 < limit**2)
-        return normal, offset, surface.valid[at] & hit & near
+        limit = jnp.maximum(far, surface.gap[nearest])
+        near = (jnp.abs(across) < far) & (least - across**2 < limit**2)
+        return normal, offset, surface.valid[nearest] & hit & near
 
-    normal, offset, found = jax.vmap(of)(local.surfaces, columns, local.poses)
+    normal, offset, found = jax.vmap(on_keyframe)(local.surfaces, columns, local.poses)
     found = found.astype(points.dtype)
-    return _Pairs(normal, offset, found / jnp.maximum(found.sum(axis=0), 1.0)[None])
+    share = found / jnp.maximum(found.sum(axis=0), 1.0)[None]
+    return _Correspondences(normal, offset, share)
 
 
-def _system(
-    spec: AlignSpec, pairs: _Pairs, points: Array, pose: Array, kernel: Array
+def _normal_equations(
+    spec: AlignSpec, pairs: _Correspondences, points: Array, pose: Array, kernel: Array
 ) -> tuple[Array, Array]:
-    """Information (3, 3) of the pairs in a pose, and its product (3,) with the step to take."""
-    turned = points @ rotation(pose[2]).T
-    x, y = turned.T
-    a, b = pairs.normal[..., 0], pairs.normal[..., 1]
-    error = a * (x + pose[0])[None] + b * (y + pose[1])[None] - pairs.offset
+    """H (3, 3) and -sum w J^T e / noise^2 (3,), for points (N, 2), robot frame, at a pose (3,)."""
+    x, y = (points @ rotation(pose[2]).T).T
+    normal_x, normal_y = pairs.normal[..., 0], pairs.normal[..., 1]
+    error = normal_x * (x + pose[0])[None] + normal_y * (y + pose[1])[None] - pairs.offset
     weight = pairs.share / (1.0 + (error / kernel) ** 2) ** 2
-    lever = b * x[None] - a * y[None]
-    rows = a, b, lever
-    total = lambda u, v: jnp.sum(weight * u * v)
-    upper = {(i, j): total(rows[i], rows[j]) for i in range(3) for j in range(i, 3)}
-    row = lambda i: jnp.stack([upper[min(i, j), max(i, j)] for j in range(3)])
-    square = jnp.stack([row(0), row(1), row(2)])
-    pull = jnp.stack([total(row, -error) for row in rows])
-    return square / spec.noise**2, pull / spec.noise**2
+    by_heading = normal_y * x[None] - normal_x * y[None]
+    jacobian = normal_x, normal_y, by_heading
+
+    def total(first: Array, second: Array) -> Array:
+        return jnp.sum(weight * first * second)
+
+    upper = {(i, j): total(jacobian[i], jacobian[j]) for i in range(3) for j in range(i, 3)}
+    square = jnp.stack(
+        [jnp.stack([upper[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)]
+    )
+    descent = jnp.stack([total(column, -error) for column in jacobian])
+    return square / spec.noise**2, descent / spec.noise**2
 
 
 def descend(
@@ -199,87 +273,140 @@ def descend(
     far: tuple[float, ...],
     kernel: float,
 ) -> tuple[Array, Array, Array]:
-    """Pose (3,) of a scan from a first guess of it, its information, and the part explained."""
-    told, sure = wheels
+    """Point-to-line ICP of one scan against the local map; the module's docstring has the formulas.
 
-    def pairs_at(pose: Array, far: Array) -> _Pairs:
-        return _partners(spec, lidar, local, to_world(pose, points), hit, far)
+        for each distance of `far`:
+            find the correspondences at the pose
+            repeat `spec.inner` times:  pose += (H + H_odom)^-1 (...)
 
-    def improve(pairs: _Pairs, pose: Array, _: None) -> tuple[Array, None]:
-        square, pull = _system(spec, pairs, points, pose, kernel)
-        off = told - pose
-        pull = pull + sure @ off.at[2].set(wrap_angle(off[2]))
-        root = inverse_root(square + sure)[0]
-        return pose + root.T @ (root @ pull), None
+    Args:
+        spec: Options.
+        lidar: The scanner that the map was made with.
+        local: What to match against.
+        points: (N, 2) [m] of the scan, robot frame.
+        hit: (N,) bool, those of them that exist.
+        start: (3,) initial pose, in the frame of the map.
+        wheels: Pose (3,) by the odometry, and its information (3, 3).
+        far: [m] largest distance of a correspondence, iteration by iteration.
+        kernel: [m] scale of the Geman-McClure kernel.
 
-    def turn(pose: Array, far: Array) -> tuple[Array, None]:
-        return lax.scan(partial(improve, pairs_at(pose, far)), pose, length=spec.inner)
+    Returns:
+        Pose (3,), its heading not wrapped; information (3, 3) of the scan alone, in the frame of
+        the map; inlier fraction (), in which a residual e counts exp(-(e / kernel)^2 / 8).
+    """
+    odometry_pose, odometry_information = wheels
 
-    pose, _ = lax.scan(turn, start, jnp.array(far))
-    pairs = pairs_at(pose, jnp.asarray(far[-1]))
-    square, _ = _system(spec, pairs, points, pose, kernel)
-    there = to_world(pose, points)
-    error = jnp.sum(pairs.normal * there[None], axis=-1) - pairs.offset
-    near = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel) ** 2) / 8), 0.0)
+    def correspondences(pose: Array, far: Array) -> _Correspondences:
+        return _correspondences(spec, lidar, local, to_world(pose, points), hit, far)
+
+    def gauss_newton(pairs: _Correspondences, pose: Array, _: None) -> tuple[Array, None]:
+        information, descent = _normal_equations(spec, pairs, points, pose, kernel)
+        offset = odometry_pose - pose
+        descent = descent + odometry_information @ offset.at[2].set(wrap_angle(offset[2]))
+        root = inverse_root(information + odometry_information)[0]
+        return pose + root.T @ (root @ descent), None
+
+    def iterate(pose: Array, far: Array) -> tuple[Array, None]:
+        step = partial(gauss_newton, correspondences(pose, far))
+        return lax.scan(step, pose, length=spec.inner)
+
+    pose, _ = lax.scan(iterate, start, jnp.array(far))
+    pairs = correspondences(pose, jnp.asarray(far[-1]))
+    information, _ = _normal_equations(spec, pairs, points, pose, kernel)
+    registered = to_world(pose, points)
+    error = jnp.sum(pairs.normal * registered[None], axis=-1) - pairs.offset
+    inlier = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel) ** 2) / 8), 0.0)
     count = jnp.maximum(jnp.sum(hit, dtype=pose.dtype), 1.0)
-    return pose, square, jnp.sum(jnp.max(near, axis=0)) / count
+    return pose, information, jnp.sum(jnp.max(inlier, axis=0)) / count
 
 
 def align(
     spec: AlignSpec, lidar: Lidar, local: LocalMap, scan: Scan, wheels: Array
 ) -> tuple[LocalMap, Aligned]:
-    """Align a scan, and let it join the local map if it was made somewhere new.
+    """Match one scan, coarse to fine, and add it to the local map if it is a keyframe.
+
+        1. Predict the pose by odometry; its std grows with the motion, by `spec.slip`.
+        2. Coarse search: ICP from each heading of `spec.turns`, of few points to recent keyframes.
+        3. Keep the start of the largest inlier fraction, less a penalty on its turn.
+        4. Refine: ICP of all points to all keyframes, with closer correspondences.
+        5. If that is not finite, the predicted pose and no information.
 
     Args:
-        spec: How.
+        spec: Options.
         lidar: The scanner.
-        local: Of the scans before.
+        local: The local map of the scans before.
         scan: One scan.
-        wheels: (3,) motion since the scan before, by the wheels.
+        wheels: (3,) odometry increment since the scan before.
+
+    Returns:
+        The local map after the scan, and the increment that the scan matcher finds.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
     """
     every = -(-lidar.beams // spec.beams)
     points, hit = lidars.points(scan, lidar)[::every], scan.hit[::every]
-    guess = compose(local.pose, wheels)
-    rolled = jnp.stack([jnp.hypot(wheels[0], wheels[1]), jnp.abs(wheels[2])])
-    unsure = jnp.array(spec.floor) ** 2 + (jnp.array(spec.slip) * rolled) ** 2
-    sure = jnp.diag(1.0 / jnp.stack([unsure[0], unsure[0], unsure[1]]))
-    wheels_say = guess, sure
+    predicted = compose(local.pose, wheels)
+    moved = jnp.stack([jnp.hypot(wheels[0], wheels[1]), jnp.abs(wheels[2])])
+    variance = jnp.array(spec.floor) ** 2 + (jnp.array(spec.slip) * moved) ** 2
+    odometry_information = jnp.diag(1.0 / jnp.stack([variance[0], variance[0], variance[1]]))
+    prior = predicted, odometry_information
 
-    back = jnp.arange(min(spec.recent, spec.scans), dtype=jnp.int32)
-    last = (local.held - 1 - back) % spec.scans
-    some = lambda x: x[last]
-    few = local._replace(surfaces=jax.tree.map(some, local.surfaces), poses=some(local.poses))
-    thin = slice(None, None, spec.thin)
-    starts = guess[None] + jnp.array([[0.0, 0.0, turn] for turn in spec.turns])
-    find = lambda start: descend(
-        spec, lidar, few, points[thin], hit[thin], start, wheels_say, spec.far, spec.kernel[0]
+    start = _best_start(spec, lidar, local, points, hit, prior, variance[1])
+    pose, information, explained = descend(
+        spec, lidar, local, points, hit, start, prior, spec.near, spec.kernel[1]
     )
-    poses, _, explained = jax.vmap(find)(starts)
-    off = wrap_angle(poses[:, 2] - guess[2])
-    best = jnp.argmax(explained - LIKELY * off**2 / unsure[1])
-    pose, square, explained = descend(
-        spec, lidar, local, points, hit, poses[best], wheels_say, spec.near, spec.kernel[1]
-    )
-    good = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(square))
-    pose, square = jnp.where(good, pose, guess), jnp.where(good, square, 0.0)
+    finite = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
+    pose, information = jnp.where(finite, pose, predicted), jnp.where(finite, information, 0.0)
     pose = pose.at[2].set(wrap_angle(pose[2]))
-    turn = jnp.eye(3).at[:2, :2].set(rotation(local.pose[2]))
-    aligned = Aligned(between(local.pose, pose), turn.T @ square @ turn, explained)
-    return _joined(spec, lidar, local, scan, pose), aligned
+    turn = jnp.eye(3).at[:2, :2].set(rotation(local.pose[2]))  # from the frame of the pose before
+    aligned = Aligned(between(local.pose, pose), turn.T @ information @ turn, explained)
+    return _add_keyframe(spec, lidar, local, scan, pose), aligned
 
 
-LIKELY = 0.005  # part explained that half a squared standard deviation of the turn outweighs
+def _best_start(
+    spec: AlignSpec,
+    lidar: Lidar,
+    local: LocalMap,
+    points: Array,
+    hit: Array,
+    prior: tuple[Array, Array],
+    heading_variance: Array,
+) -> Array:
+    """Pose (3,) that the coarse search of `align` ends at."""
+    age = jnp.arange(min(spec.recent, spec.scans), dtype=jnp.int32)
+    recent_slots = (local.held - 1 - age) % spec.scans
+    surfaces, poses = jax.tree.map(lambda x: x[recent_slots], (local.surfaces, local.poses))
+    recent = local._replace(surfaces=surfaces, poses=poses)
+    thinned = slice(None, None, spec.thin)
+    predicted = prior[0]
+    starts = predicted[None] + jnp.array([[0.0, 0.0, turn] for turn in spec.turns])
+
+    def search(start: Array) -> tuple[Array, Array, Array]:
+        kernel = spec.kernel[0]
+        return descend(
+            spec, lidar, recent, points[thinned], hit[thinned], start, prior, spec.far, kernel
+        )
+
+    poses, _, explained = jax.vmap(search)(starts)
+    turned = wrap_angle(poses[:, 2] - predicted[2])
+    return poses[jnp.argmax(explained - LIKELY * turned**2 / heading_variance)]
 
 
-def _joined(spec: AlignSpec, lidar: Lidar, local: LocalMap, scan: Scan, pose: Array) -> LocalMap:
-    """The local map after a scan at a pose."""
+def _add_keyframe(
+    spec: AlignSpec, lidar: Lidar, local: LocalMap, scan: Scan, pose: Array
+) -> LocalMap:
+    """The local map after a scan at a pose, which becomes a keyframe if it has moved enough."""
     size = spec.scans
     moved = between(local.poses[(local.held - 1) % size], pose)
     far = jnp.hypot(moved[0], moved[1]) > spec.apart[0]
     new = far | (jnp.abs(moved[2]) > spec.apart[1]) | (local.held == 0)
     slot = jnp.where(new, local.held % size, size)
     own = laid(surfaces(scan, lidar), pose)
-    put = lambda old, x: old.at[slot].set(x, mode="drop")
+
+    def put(held: Array, item: Array) -> Array:
+        return held.at[slot].set(item, mode="drop")
+
     return LocalMap(
         jax.tree.map(put, local.surfaces, own),
         put(local.poses, pose),
@@ -297,45 +424,49 @@ def follow(
     wheels: Array,
     count: Array | None = None,
 ) -> tuple[LocalMap, Aligned]:
-    """Align scans [T] one after the other, and the motions [T] that they tell.
+    """Match scans [T] one after the other; return the local map after them, and increments [T].
 
     Args:
-        spec: How.
+        spec: Options.
         lidar: The scanner.
-        local: Of the scans before.
+        local: The local map of the scans before.
         scans: [T].
-        wheels: (T, 3) motions since the scan before, by the wheels; zero at the first of all.
-        count: () int32 scans that there are, the first ones; of the others nothing is kept.
+        wheels: (T, 3) odometry increments since the scan before; zero at the first of all.
+        count: () int32 number of scans that exist, the first ones; None for all. The others are
+            padding and leave the local map as it is.
+
+    Raises:
+        ValueError: The ranges are not those of this lidar; while tracing.
     """
-    known = jnp.arange(len(wheels), dtype=jnp.int32) < (len(wheels) if count is None else count)
+    exists = jnp.arange(len(wheels), dtype=jnp.int32) < (len(wheels) if count is None else count)
 
     def body(local: LocalMap, now: tuple[Scan, Array, Array]) -> tuple[LocalMap, Aligned]:
-        *given, there = now
-        after, aligned = align(spec, lidar, local, *given)
-        return jax.tree.map(partial(jnp.where, there), after, local), aligned
+        scan, odometry, exists = now
+        after, aligned = align(spec, lidar, local, scan, odometry)
+        return jax.tree.map(partial(jnp.where, exists), after, local), aligned
 
-    return lax.scan(body, local, (scans, wheels, known))
-
-
-FLOOR = (0.01, 0.005)  # [m], [rad] of wheels beside scans, even where they stand still
+    return lax.scan(body, local, (scans, wheels, exists))
 
 
 def fuse(wheels: Array, noise: Array, aligned: Aligned, scale: Array) -> tuple[Array, Array]:
-    """Motion (3,) by wheels and scans together, and its covariance (3, 3).
+    """Increment (3,) by odometry and scan matching together, and its covariance (3, 3).
+
+    A Kalman update in information form: cov = (noise^-1 + H)^-1, with the scan's information H
+    over `scale`^2. Without any, odometry and its noise are returned as they are.
 
     Args:
-        wheels: (3,) motion.
+        wheels: (3,) odometry increment.
         noise: (3, 3) its covariance; `FLOOR` is added where there is something to fuse it with.
-        aligned: What the scans tell.
-        scale: () factor on their standard deviation.
+        aligned: Result of scan matching.
+        scale: () factor on the standard deviation of scan matching.
     """
-    told = aligned.information / scale**2
+    information = aligned.information / scale**2
     floor = jnp.array([FLOOR[0], FLOOR[0], FLOOR[1]]) ** 2
-    root = inverse_root(noise + jnp.diag(floor))[0]
-    both = inverse_root(root.T @ root + told)[0]
-    cov = both.T @ both
-    off = aligned.motion - wheels
-    off = off.at[2].set(wrap_angle(off[2]))
-    any_told = jnp.any(aligned.information != 0.0)
-    motion = wheels + cov @ (told @ off)
-    return jnp.where(any_told, motion, wheels), jnp.where(any_told, cov, noise)
+    noise_root = inverse_root(noise + jnp.diag(floor))[0]
+    cov_root = inverse_root(noise_root.T @ noise_root + information)[0]
+    cov = cov_root.T @ cov_root
+    innovation = aligned.motion - wheels
+    innovation = innovation.at[2].set(wrap_angle(innovation[2]))
+    matched = jnp.any(aligned.information != 0.0)
+    motion = wheels + cov @ (information @ innovation)
+    return jnp.where(matched, motion, wheels), jnp.where(matched, cov, noise)

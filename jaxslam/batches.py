@@ -1,4 +1,4 @@
-"""Many of the same thing: a few at a time on each device, on all devices of all processes."""
+"""Map a function over many items: in batches on each device, on all devices of all processes."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -17,193 +17,257 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxslam import programs
 from jaxslam.types import Array
 
-FLAGS = {"--xla_force_host_platform_device_count": "{cores}"}
-# By default XLA splits operations among the threads of all devices, and these are short.
-FLAGS["--xla_disable_hlo_passes"] = "cpu-parallel-task-assigner"
+FLAGS = {  # of XLA
+    "--xla_force_host_platform_device_count": "{cores}",
+    # By default XLA splits operations among the threads of all devices, and these are short.
+    "--xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+}
 
 
 def use_cores(cores: int | None = None) -> None:
-    """Give JAX a device for each core of a CPU, which it leaves operations to as a whole.
+    """Make each CPU core a device of JAX, and let XLA run each operation on one core.
 
-    To be called before JAX does its first work: afterwards, or where JAX was told to use something
-    else than the CPU, it does nothing. What the user has set in XLA_FLAGS stays.
+    Call it before JAX does its first work: once JAX has started its backends their devices are
+    fixed, and this does nothing. It does nothing either where `jax_platforms` names another
+    platform than the CPU first. Flags that XLA_FLAGS holds already keep their values.
 
     Args:
-        cores: How many; by default all that this process may use.
+        cores: Number of devices; by default all cores that this process may use.
     """
-    if (jax.config.jax_platforms or "cpu").split(",")[0] != "cpu":
+    first_platform = (jax.config.jax_platforms or "cpu").split(",")[0]
+    if first_platform != "cpu" or _backends_started():
         return
+    count = cores or cores_here()
+    present = os.environ.get("XLA_FLAGS", "")
+    flags = [f"{flag}={value.format(cores=count)}" for flag, value in FLAGS.items()]
+    added = [flag for flag in flags if flag.split("=")[0] not in present]
+    os.environ["XLA_FLAGS"] = " ".join([*present.split(), *added])
+
+
+def _backends_started() -> bool:
+    """Whether JAX has fixed its devices: after that it refuses to change their number.
+
+    JAX has no public function that says so without starting the backends, so a change is tried
+    and undone.
+    """
     devices = jax.config.jax_num_cpu_devices
     try:
-        # JAX refuses any other number once it has begun.
         jax.config.update("jax_num_cpu_devices", max(0, devices) + 1)
     except RuntimeError:
-        return
+        return True
     jax.config.update("jax_num_cpu_devices", devices)
-    cores = cores or cores_here()
-    given = os.environ.get("XLA_FLAGS", "")
-    more = [f"{flag}={value.format(cores=cores)}" for flag, value in FLAGS.items()]
-    more = [flag for flag in more if flag.split("=")[0] not in given]
-    os.environ["XLA_FLAGS"] = " ".join([*given.split(), *more])
+    return False
 
 
 def cores_here() -> int:
-    """Number of cores that this process may use."""
-    own = getattr(os, "sched_getaffinity", None)
-    return len(own(0)) if own else os.cpu_count() or 1
+    """Number of CPU cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def one_by_one(function: Callable) -> Callable:
-    """`function` that takes the items of a batch in turn on a CPU: each stays in its cache.
+    """`function` whose `jax.vmap` is a loop over the batch on a CPU, and a plain vmap elsewhere.
 
-    What it gives is worked out once. Of operations on a whole batch XLA repeats those that look
-    cheap in all that is made of their result, which for some on images takes most of the time.
+        vmap(one_by_one(f))(x)  =  lax.map(f, x)  on a CPU,  vmap(f)(x)  on other platforms
+
+    On a CPU the arrays of one item stay in the cache, a `lax.cond` stays a branch, and results are
+    computed once: XLA fuses operations on a whole batch that it takes for cheap into each of
+    their consumers and repeats them there, which for some on images is most of the run time.
+    Under several vmaps each becomes a loop.
 
     Args:
-        function: Of arrays, or records of them, closing over none.
+        function: Of arrays, or records of them; it must not close over arrays.
     """
-    turns = custom_vmap(function)
+    sequential = custom_vmap(function)
 
-    @turns.def_vmap
-    def _(size: int, batched: Sequence[Any], *given: Any) -> tuple[Any, Any]:
-        del size
-        items, form = jax.tree.flatten(given)
-        many = jax.tree.leaves(batched)
+    @sequential.def_vmap
+    def rule(axis_size: int, in_batched: Sequence[Any], *args: Any) -> tuple[Any, Any]:
+        del axis_size
+        leaves, treedef = jax.tree.flatten(args)
+        has_batch_axis = jax.tree.leaves(in_batched)
+        batched = [x for x, own in zip(leaves, has_batch_axis, strict=True) if own]
 
-        def of_one(how: Callable, some: list[Array]) -> Any:
-            left = iter(some)
-            whole = [next(left) if one else x for x, one in zip(items, many, strict=True)]
-            return how(*form.unflatten(whole))
+        def on_item(called: Callable, own_leaves: list[Array]) -> Any:
+            """Call on the leaves of one item, and the leaves that all items share."""
+            remaining = iter(own_leaves)
+            merged = [
+                next(remaining) if own else shared
+                for shared, own in zip(leaves, has_batch_axis, strict=True)
+            ]
+            return called(*treedef.unflatten(merged))
 
-        some = [x for x, one in zip(items, many, strict=True) if one]
-        in_turn = partial(lax.map, partial(of_one, turns))
-        together = jax.vmap(partial(of_one, function))
-        result = lax.platform_dependent(some, cpu=in_turn, default=together)
+        loop = partial(lax.map, partial(on_item, sequential))
+        vectorised = jax.vmap(partial(on_item, function))
+        result = lax.platform_dependent(batched, cpu=loop, default=vectorised)
         return result, jax.tree.map(lambda _: True, result)
 
-    return turns
+    return sequential
 
 
 def map_batches(function: Callable, items: Any, *, size: int) -> Any:
     """Map `function` over the leading axis of `items`, `size` of them vectorised at a time.
 
-    The last batch is filled up with the last item: unlike `lax.map(batch_size=...)` this compiles
-    the function once.
+    The last batch is filled up with copies of the last item: unlike `lax.map(batch_size=...)`
+    this compiles the function once.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     size = min(size, count)
     items = pad(items, to=count + -count % size)
-    fold = lambda x: x.reshape((-1, size) + x.shape[1:])
-    result = lax.map(jax.vmap(function), jax.tree.map(fold, items))
+    batches = jax.tree.map(lambda x: x.reshape((-1, size) + x.shape[1:]), items)
+    result = lax.map(jax.vmap(function), batches)
     return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:])[:count], result)
 
 
 def pad(items: Any, *, to: int) -> Any:
-    """Repeat the last of `items`, arrays that lead with one number, until there are `to`."""
+    """Repeat the last of `items`, arrays that lead with their number, until there are `to`."""
 
-    def longer(x: Any) -> Any:
-        more = to - x.shape[0]
-        if not more:
+    def lengthen(x: Any) -> Any:
+        missing = to - x.shape[0]
+        if not missing:
             return x
-        on = jnp if isinstance(x, jax.Array) else np
-        return on.concatenate([x, on.repeat(x[-1:], more, axis=0)])
+        numpy = jnp if isinstance(x, jax.Array) else np
+        return numpy.concatenate([x, numpy.repeat(x[-1:], missing, axis=0)])
 
-    return jax.tree.map(longer, items)
+    return jax.tree.map(lengthen, items)
 
 
 class Spread:
-    """A function of one item, compiled for `size` of them, for any number on all devices.
+    """Map a function over any number of items on all devices, `size` of them vectorised at a time.
 
-    Each device has a program of its own, the same for all, and takes `size` items at a time,
-    vectorised: the result of an item depends neither on the other items nor on the number of
-    devices or processes, bit for bit where the devices are alike. (XLA compiles a program for two
-    devices to other roundings than one for one device.) Fewer items than fill the devices are
-    vectorised more narrowly, and may differ by rounding. All processes must call it with the same
-    arguments, and all get the whole result.
+    Device k of D gets a contiguous block of the items, as `rounds` batches of `size`; the last
+    item is repeated until all batches are full. 19 items, D = 2, size = 4, three rounds:
+
+                    round 0        round 1        round 2
+        device 0    items 0-3      items 4-7      items 8-11
+        device 1    items 12-15    items 16-18,-  -  -  -  -       (-: copy of item 18)
+
+    The host compiles, puts all batches of all devices into their queues without waiting, and
+    returns; results are waited for later:
+
+        host        compile | enqueue |  free for other work   | wait, gather |
+        device 0                 | round 0 | round 1 | round 2 |
+        device 1                 | round 0 | round 1 | round 2 |
+
+    Each device has a compiled program of its own, all from the same trace. So the result of an
+    item depends neither on the other items nor on the number of devices or processes, bit for bit
+    where the devices are alike. (One program for several devices, sharded by XLA, is compiled to
+    other roundings than a program for one.) Only where there are fewer items than D * size are
+    batches smaller, and results may differ by rounding.
+
+    All processes must call it with the same arguments, and all get the whole result.
     """
 
     def __init__(self, function: Callable, *, size: int, static: int = 0):
-        """Prepare it.
+        """Wrap a function of one item.
 
         Args:
-            function: Of `static` hashable arguments, one record common to all, and one item.
-            size: Items that a device works on together; one alone is not vectorised.
+            function: Of `static` hashable arguments, one record common to all items, and one item.
+            size: Items of a batch; a single one is not vectorised.
             static: Number of leading arguments that are static under jit.
         """
         self.size = size
         self._function = function
         self._static = static
 
-    def __call__(self, *given: Any, devices: Sequence[jax.Device] | None = None) -> Any:
+    def __call__(self, *args: Any, devices: Sequence[jax.Device] | None = None) -> Any:
         """Results of the function, as NumPy arrays that lead with the number of items.
 
         Args:
-            given: The static arguments, the common record, and the items, arrays that lead with
+            args: The static arguments, the common record, and the items: arrays that lead with
                 their number.
             devices: To be used, as many of each process; all by default.
         """
-        return self.begin(*given, devices=devices)()
+        return self.begin(*args, devices=devices)()
 
-    def begin(self, *given: Any, devices: Sequence[jax.Device] | None = None) -> Callable[[], Any]:
-        """Start the work, with the arguments of a call, and return what waits for its results."""
-        fixed, (common, items) = given[: self._static], given[self._static :]
+    def begin(self, *args: Any, devices: Sequence[jax.Device] | None = None) -> Callable[[], Any]:
+        """Start the work, with the arguments of a call.
+
+        Returns:
+            A function without arguments that waits for the results and returns them.
+        """
+        static, (common, items) = args[: self._static], args[self._static :]
         mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("items",))
         count = jax.tree.leaves(items)[0].shape[0]
         size = min(self.size, -(-count // mesh.size))
-        each = -(-count // (size * mesh.size))  # batches of a device
-        items = pad(items, to=each * size * mesh.size)
-        own = [(k, d) for k, d in enumerate(mesh.devices) if d in mesh.local_devices]
-        common = [jax.device_put(common, device) for _, device in own]
+        rounds = -(-count // (size * mesh.size))
+        items = pad(items, to=mesh.size * rounds * size)
 
-        def batch(place: int, number: int, device: jax.Device) -> Any:
-            first = (place * each + number) * size
-            return jax.device_put(jax.tree.map(lambda x: x[first : first + size], items), device)
+        def batch_on(device: jax.Device, number: int) -> Any:
+            own = slice(number * size, (number + 1) * size)
+            return jax.device_put(jax.tree.map(lambda x: x[own], items), device)
 
-        shares = [[batch(k, number, device) for number in range(each)] for k, device in own]
-        whole = self._function, *fixed
-        lowered = [
-            _run.trace(whole, known, share[0]).lower()
-            for known, share in zip(common, shares, strict=True)
-        ]
-        with ThreadPoolExecutor(min(len(own), cores_here())) as pool:
-            list(pool.map(lambda one: one.compile(), lowered))
-        # One batch of every device after the other: none waits for the next.
-        ready = [
-            [_run(whole, known, one) for known, one in zip(common, now, strict=True)]
-            for now in zip(*shares, strict=True)
+        # Arguments to the devices of this process; the others serve the rest of the mesh.
+        local = [(k, d) for k, d in enumerate(mesh.devices) if d in mesh.local_devices]
+        common_of = [jax.device_put(common, device) for _, device in local]
+        batches_of = [[batch_on(d, k * rounds + r) for r in range(rounds)] for k, d in local]
+
+        program = self._function, *static
+        _compile(program, common_of, [batches[0] for batches in batches_of])
+        # Dispatch is asynchronous: one batch of every device after the other, so that none idles.
+        results = [
+            [_run(program, *own) for own in zip(common_of, batches, strict=True)]
+            for batches in zip(*batches_of, strict=True)
         ]
 
         def finish() -> Any:
-            whole = [_gather(mesh, parts) for parts in ready]
-
-            def join(*rounds: np.ndarray) -> np.ndarray:
-                x = np.stack([x.reshape(mesh.size, size, *x.shape[1:]) for x in rounds], axis=1)
-                return x.reshape(-1, *x.shape[3:])[:count]
-
-            return jax.tree.map(join, *whole)
+            by_round = [_gather(mesh, parts) for parts in results]
+            ordered = partial(_in_order, devices=mesh.size, size=size)
+            return jax.tree.map(lambda *parts: ordered(parts)[:count], *by_round)
 
         return finish
 
 
-@partial(programs.jit, static_argnames="fixed")
-def _run(fixed: tuple, common: Any, items: Any) -> Any:
-    """A function, with its static arguments, of some items; one alone is not vectorised."""
-    function = partial(*fixed, common)
+def _compile(program: tuple, common_of: list[Any], batch_of: list[Any]) -> None:
+    """Compile `_run` for each device, in parallel: XLA does not hold Python's lock.
+
+    Tracing and lowering do, and come first. The programs stay in JAX's cache, where the calls of
+    `_run` find them.
+    """
+    lowered = [
+        _run.trace(program, common, batch).lower()
+        for common, batch in zip(common_of, batch_of, strict=True)
+    ]
+    with ThreadPoolExecutor(min(len(lowered), cores_here())) as pool:
+        list(pool.map(lambda each: each.compile(), lowered))
+
+
+@partial(programs.jit, static_argnames="program")
+def _run(program: tuple, common: Any, items: Any) -> Any:
+    """Results of one batch, arrays that lead with its size; a single item is not vectorised.
+
+    Args:
+        program: The function of a `Spread`, and its static arguments.
+        common: The record common to all items.
+        items: The batch: arrays that lead with its size.
+    """
+    function = partial(*program, common)
     if jax.tree.leaves(items)[0].shape[0] > 1:
         return jax.vmap(function)(items)
-    one = function(jax.tree.map(lambda x: x[0], items))
-    return jax.tree.map(lambda x: x[None], one)
+    single = function(jax.tree.map(lambda x: x[0], items))
+    return jax.tree.map(lambda x: x[None], single)
 
 
 def _gather(mesh: Mesh, parts: list[Any]) -> Any:
-    """What each device of a mesh has of a result, together, on all processes as NumPy arrays."""
+    """Results of one round of all devices, as NumPy arrays (D * size, ...) on all processes.
 
-    def whole(*parts: Array) -> Array:
+    Args:
+        mesh: The D devices.
+        parts: The results (size, ...) of those of this process, in the order of the mesh.
+    """
+
+    def sharded(*shards: Array) -> Array:
         sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
-        shape = (mesh.size * len(parts[0]), *parts[0].shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, sharding, parts)
+        shape = (mesh.size * len(shards[0]), *shards[0].shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, sharding, shards)
 
-    result = jax.tree.map(whole, *parts)
+    result = jax.tree.map(sharded, *parts)
     if jax.process_count() > 1:
         return multihost_utils.process_allgather(result, tiled=True)
     return jax.tree.map(np.asarray, result)
+
+
+def _in_order(by_round: Sequence[np.ndarray], *, devices: int, size: int) -> np.ndarray:
+    """Join the arrays (D * size, ...) of all rounds in the order of the items: device by device."""
+    split = [x.reshape(devices, size, *x.shape[1:]) for x in by_round]
+    by_device = np.stack(split, axis=1)  # (D, rounds, size, ...)
+    return by_device.reshape(-1, *by_device.shape[3:])

@@ -32,7 +32,7 @@ from jaxslam.types import NODE
 from jaxslam.view import View
 from jaxslam.world import World
 
-AREA = 1.0  # [m^2] of the smallest region of a map that is drawn
+AREA = 1.0  # [m^2] of the smallest region that `map --regions all` keeps
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 `jaxslam COMMAND --help` lists the options of a command, `jaxslam --version` prints the version."""
 
@@ -49,8 +49,8 @@ def main(argv: list[str] | None = None) -> int:
     except InputError as error:
         print(f"jaxslam: error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt as stop:
-        print(f"jaxslam: {str(stop) or 'interrupted, nothing written'}", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"jaxslam: {str(interrupt) or 'interrupted, nothing written'}", file=sys.stderr)
         return 130
     return 0
 
@@ -64,54 +64,56 @@ def simulate(
     labels: Literal["runs", "codes"] = "runs",
     out: Path = Path("out"),
 ) -> None:
-    """Drive a simulated robot from S to F, many times, and run SLAM on every drive.
+    """Run SLAM on Monte-Carlo trials: simulated drives of one robot from S to F.
 
-    Writes metrics.json, of all runs, and trajectory.tum, truth.tum, map.geojson, path.png and
-    errors.png, of run 0, whose time stamps count its scans.
+    Writes metrics.json, of all trials, and trajectory.tum, truth.tum, map.geojson, path.png and
+    errors.png of trial 0, whose time stamps are the scan numbers.
 
     Args:
-        world: A world with a drive: office.
-        runs: How many times.
-        seed: Of the noise of wheels and lidar.
-        noise: File of the noise that the filter assumes; by default it is the robot's own.
-        landmarks: All kinds, or the paper's nodes alone.
-        labels: What tells wall cells apart: straight runs, or the paper's edge codes.
+        world: World with a path from S to F: office.
+        runs: Number of trials.
+        seed: Random seed of the odometry and range noise.
+        noise: File of the noise parameters of the filter (Q and R); by default those of the
+            simulated robot.
+        landmarks: Landmark types: all, or only the junctions (the paper's nodes).
+        labels: Labels of occupied cells in the Voronoi expansion: straight wall segments (runs),
+            or the paper's edge codes (codes).
         out: Folder for the results.
     """
     use_cores()
     within("--runs", runs, 1, 10**6)
     within("--seed", seed, 0, 2**32 - 1)
     with named("--world"):
-        known = World(jnp.asarray(worlds.named(world).walls, float))
+        walls = World(jnp.asarray(worlds.named(world).walls, float))
         path = jnp.asarray(plan.densify(worlds.drive(world)), float)
     config = Config(labels=labels)
     config = config._replace(kinds=(NODE,)) if landmarks == "nodes" else config
-    assumed = noise_of(noise, slam.wheel_noise(Robot()))
-    given = (jax.random.key(seed), config, assumed, known, Robot(), path)
-    with folder(out) as place:
+    robot = Robot()
+    noise_params = noise_of(noise, slam.wheel_noise(robot))
+    key = jax.random.key(seed)
+    with folder(out) as out_dir:
         keep_compiled()
-        steps = monte_carlo.drive_steps(Robot(), path)
+        steps = monte_carlo.drive_steps(robot, path)
         with stopwatch() as seconds:
-            tracks = _watch(monte_carlo.experiment(*given, runs=runs, steps=steps), runs)
+            groups = monte_carlo.experiment(
+                key, config, noise_params, walls, robot, path, runs=runs, steps=steps
+            )
+            tracks = _collect(groups, runs)
         numbers = monte_carlo.evaluate(tracks) | {
             "ate_rmse_m": report.aligned_error(tracks),
-            "path_length_m": float(np.mean([report.length(way) for way in tracks.truth])),
+            "path_length_m": float(np.mean([report.length(poses) for poses in tracks.truth])),
             "seconds": seconds,
         }
-        truth, survey = monte_carlo.replay(*given, run=0, steps=steps)
-        truth, stamps = np.asarray(truth, np.float64), np.arange(steps, dtype=float)
-        report.write(place, numbers, stamps, survey)
-        tum.write(place / "truth.tum", stamps, truth)
-        lines = {"odometry": tracks.odometry[0], "truth": truth}
-        report.draw(
-            place,
-            config,
-            survey,
-            lines,
-            report.error_of(survey.poses, truth),
-            world=known,
+        truth, result = monte_carlo.replay(
+            key, config, noise_params, walls, robot, path, run=0, steps=steps
         )
-    report.tell(numbers, f"{runs} runs of {steps} scans, world {world}", out)
+        truth, stamps = np.asarray(truth, np.float64), np.arange(steps, dtype=float)
+        report.write(out_dir, numbers, stamps, result)
+        tum.write(out_dir / "truth.tum", stamps, truth)
+        trajectories = {"odometry": tracks.odometry[0], "truth": truth}
+        error = report.error_of(result.poses, truth)
+        report.draw(out_dir, config, result, trajectories, error, world=walls)
+    report.tell(numbers, f"{runs} trials of {steps} scans, world {world}", out)
 
 
 def run(
@@ -128,120 +130,136 @@ def run(
     view: Literal["live", "file"] | None = None,
     out: Path = Path("out"),
 ) -> None:
-    """Run SLAM on a recorded log.
+    """Run SLAM on a laser log.
 
-    Writes metrics.json, trajectory.tum, path.png and errors.png; the topological map as
-    map.geojson and, with the extra [graph], map.graphml; what the scans saw as map.yaml and
-    map.pgm, for map_server and `jaxslam map`; and graph.g2o, for optimisers. The first scan is made
-    at the origin of the map.
+    Writes metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson
+    and, with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for
+    map_server and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of
+    the first scan is the origin of the map.
 
     Args:
-        log: CARMEN log, ROS bag, pose graph of g2o with its scans, or recording as a NumPy file;
-            `killian` is the log that the extra [data] brings.
-        reference: Trajectory to compare with, a TUM file on the log's clock.
-        relations: Verified relative poses to compare with, on the log's clock.
-        odometry: Scans aligned to those before and fused with the wheels, or the wheels alone.
-        smooth: At the end, tell all poses and places by all that was seen, and by scans laid on
-            those of earlier visits to a place; else each pose stays as the filter told it.
-        noise: File of the noise that the filter assumes; by default a cautious one.
-        scan_topic: Topic of the laser scans in a bag; by default that with most messages.
-        odometry_topic: Topic of the odometry in a bag, or of the transforms; likewise.
-        scan: Number of a scan, from 0, whose local diagram is drawn: scan.png.
-        animate: Film the run: run.gif.
-        view: Show the run as it goes on in rerun's viewer, or write run.rrd for it; needs the
-            extra [view].
+        log: CARMEN log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is the log
+            that the extra [data] installs.
+        reference: Reference trajectory to evaluate with: a TUM file with the log's clock.
+        relations: Verified relative poses to evaluate with, with the log's clock.
+        odometry: Scan matching fused with wheel odometry (scan), or wheel odometry alone (wheels).
+        smooth: Batch-smooth the trajectory and landmarks, with loop closures; --no-smooth writes
+            the online estimates.
+        noise: File of the noise parameters of the filter (Q and R); by default cautious ones.
+        scan_topic: Topic of the laser scans in a bag; by default the one with most messages.
+        odometry_topic: Topic of the odometry or of the transforms in a bag; by default the one
+            with most messages.
+        scan: Number of a scan, from 0, whose local Voronoi diagram is drawn: scan.png.
+        animate: Write an animation of the run: run.gif.
+        view: Show the run in the rerun viewer while it is processed (live), or write run.rrd for it
+            (file); needs the extra [view].
         out: Folder for the results.
     """
-    recording = readers.read(log, scans=scan_topic, odometry=odometry_topic)
+    laser_log = readers.read(log, scans=scan_topic, odometry=odometry_topic)
+    times = laser_log.times
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
-    by_scans = odometry == "scan"
-    assumed = noise_of(noise, slam.log_noise(aligned=by_scans))
+    scan_matching = odometry == "scan"
+    noise_params = noise_of(noise, slam.log_noise(aligned=scan_matching))
     if scan is not None:
-        within("--scan", scan, 0, len(recording.times) - 1)
-    config = logs.config_of_scans([recording])._replace(landmarks=online.MOST)
-    wheels = seen_from(recording.odometry[0], recording.odometry)
+        within("--scan", scan, 0, len(times) - 1)
+    config = logs.config_of_scans([laser_log])._replace(landmarks=online.MOST)
+    odom_poses = seen_from(laser_log.odometry[0], laser_log.odometry)
     with named(f"{reference or ''}"):
-        blind = {} if known is None else report.against_reference(recording.times, wheels, known)
+        dead_reckoning = report.judged(laser_log, odom_poses, known, None)
     with named(f"{relations or ''}"):
-        blind |= {} if verified is None else report.against_relations(recording, wheels, verified)
-    motions = logs.motions(wheels)
-    scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
-    with folder(out) as place:
+        dead_reckoning |= report.judged(laser_log, odom_poses, None, verified)
+    increments = logs.motions(odom_poses)
+    scans = lidar.limit(jnp.asarray(laser_log.ranges, float), config.lidar)
+    with folder(out) as out_dir:
         keep_compiled()
-        print(
-            f"{log}: {len(wheels)} scans of {config.lidar.beams} beams{recording.source}",
-            flush=True,
-        )
+        size = f"{len(times)} scans of {config.lidar.beams} beams"
+        print(f"{log}: {size}{laser_log.source}", flush=True)
         with stopwatch() as seconds:
-            shown = None
+            viewer = None
             if view is not None:
-                file = place / "run.rrd" if view == "file" else None
-                shown = View(config, recording.times, scans, file)
-            how = {"aligned": by_scans, "smooth": smooth}
-            survey = _map(config, assumed, motions, scans, view=shown, **how)
-            poses = survey.poses
+                file = out_dir / "run.rrd" if view == "file" else None
+                viewer = View(config, times, scans, file)
+            result = _run_slam(
+                config,
+                noise_params,
+                increments,
+                scans,
+                aligned=scan_matching,
+                smooth=smooth,
+                viewer=viewer,
+            )
+            poses = result.poses
         numbers = {
             "scans": len(poses),
-            "skipped_lines": recording.skipped,
-            "mended": recording.mended,
+            "skipped_lines": laser_log.skipped,
+            "mended": laser_log.mended,
             "odometry": odometry,
-            "path_length_m": report.length(poses if by_scans else wheels),
-            "landmarks": int(np.sum(slam.confirmed(config, survey.belief))),
-            "matches": float(np.mean(np.sum(np.asarray(survey.info.used), axis=1))),
-            "closures": len(survey.closures.first) if survey.closures else 0,
+            "path_length_m": report.length(poses if scan_matching else odom_poses),
+            "landmarks": int(np.sum(slam.confirmed(config, result.belief))),
+            "matches": float(np.mean(np.sum(np.asarray(result.info.used), axis=1))),
+            "closures": len(result.closures.first) if result.closures else 0,
             "seconds": seconds,
         }
-        lines, error = {"odometry": wheels}, None
-        filtered = np.asarray(survey.info.pose, np.float64)
+        trajectories, error = {"odometry": odom_poses}, None
+        online_poses = np.asarray(result.info.pose, np.float64)
         if known is not None:
-            lines["reference"] = report.beside(recording.times, poses, known)
-            error = report.since_start(recording.times, filtered, known)
-            numbers["nees"] = report.nees_of(error, np.asarray(survey.info.pose_cov))
-        if blind:
-            numbers |= report.judged(recording, poses, known, verified)
+            trajectories["reference"] = report.beside(times, poses, known)
+            error = report.since_start(times, online_poses, known)
+            numbers["nees"] = report.nees_of(error, np.asarray(result.info.pose_cov))
+        if dead_reckoning:
+            numbers |= report.judged(laser_log, poses, known, verified)
             if smooth:
-                numbers["filter"] = report.judged(recording, filtered, known, verified)
-            numbers["dead_reckoning"] = blind
-        report.write(place, numbers, recording.times, survey)
-        told = jnp.asarray(motions, float)
-        inputs = slam.Inputs(told, survey.nodes, aligned=survey.aligned)
-        config = config._replace(landmarks=survey.belief.seen.size)
-        report.write_maps(place, config, assumed, survey, inputs, scans)
-        report.draw(place, config, survey, lines, error, scans=scans)
+                numbers["filter"] = report.judged(laser_log, online_poses, known, verified)
+            numbers["dead_reckoning"] = dead_reckoning
+        report.write(out_dir, numbers, times, result)
+        inputs = slam.Inputs(jnp.asarray(increments, float), result.nodes, aligned=result.aligned)
+        config = config._replace(landmarks=result.belief.seen.size)
+        report.write_maps(out_dir, config, noise_params, result, inputs, scans)
+        report.draw(out_dir, config, result, trajectories, error, scans=scans)
         if scan is not None:
-            report.draw_scan(place / "scan.png", config, scans, scan)
+            report.draw_scan(out_dir / "scan.png", config, scans, scan)
         if animate:
-            film.film(place / "run.gif", config, assumed, inputs, scans, poses, wheels)
+            gif = out_dir / "run.gif"
+            film.film(gif, config, noise_params, inputs, scans, poses, odom_poses)
     report.tell(numbers, f"{len(poses)} scans of {log}", out)
 
 
-def _map(
+def _run_slam(
     config: Config,
     noise: Noise,
-    motions: np.ndarray,
+    increments: np.ndarray,
     scans: Scan,
     *,
-    view: View | None,
-    **how: bool,
+    aligned: bool,
+    smooth: bool,
+    viewer: View | None,
 ) -> Survey:
-    """`online.survey` of a log, which shows how far it is."""
-    with tqdm(total=len(motions), unit="scan", desc="compiling", mininterval=0.2) as bar:
+    """Run SLAM on a log, with a progress bar."""
+    with tqdm(total=len(increments), unit="scan", desc="compiling", mininterval=0.2) as bar:
 
-        def watch(mapper: Mapper, part: Part) -> None:
-            done = bar.n + len(part.info.finite) == len(motions)
-            bar.set_description("smoothing" if done and how["smooth"] else "mapping", refresh=False)
-            found = int(np.sum(slam.confirmed(config, mapper.belief)))
-            bar.set_postfix_str(f"{found} landmarks", refresh=False)
+        def show_progress(mapper: Mapper, part: Part) -> None:
+            done = bar.n + len(part.info.finite) == len(increments)
+            bar.set_description("smoothing" if done and smooth else "mapping", refresh=False)
+            num_landmarks = int(np.sum(slam.confirmed(config, mapper.belief)))
+            bar.set_postfix_str(f"{num_landmarks} landmarks", refresh=False)
             bar.update(len(part.info.finite))
-            if view is not None:
-                view.watch(mapper, part)
+            if viewer is not None:
+                viewer.watch(mapper, part)
 
-        given = config, noise, jnp.zeros(3), motions, scans
-        survey = online.survey(*given, watch=watch, **how)
-    if view is not None:
-        view.end(survey)
-    return survey
+        result = online.survey(
+            config,
+            noise,
+            jnp.zeros(3),
+            increments,
+            scans,
+            aligned=aligned,
+            smooth=smooth,
+            watch=show_progress,
+        )
+    if viewer is not None:
+        viewer.end(result)
+    return result
 
 
 def map_grid(
@@ -251,68 +269,74 @@ def map_grid(
     regions: Literal["largest", "all"] = "largest",
     out: Path = Path("out"),
 ) -> None:
-    """Turn a ROS occupancy map into a topological map.
+    """Extract the topological map of a ROS occupancy grid.
 
     Writes metrics.json, map.geojson, map.graphml and map.png; needs the extras [ros] and [graph].
 
     Args:
-        map: YAML file of map_server, its image beside it.
-        clearance: Radius of the robot [m]: it must fit everywhere on the map.
-        speck: Things in free space no wider than this [m] are noise.
-        regions: Where the robot can be: the largest region, or all in which its centre has 1 m^2.
+        map: YAML file of map_server, with its image in the same folder.
+        clearance: Robot radius [m]: least distance of the map to obstacles.
+        speck: Minimum obstacle size [m]: smaller ones in free space are noise.
+        regions: Connected regions of the robot's centre: the largest, or all of at least 1 m^2.
         out: Folder for the results.
     """
     within("--clearance", clearance, 0.01, 100.0)
     within("--speck", speck, 0.0, 100.0)
     graphml.require()
     grid = occupancy.read(map)
-    size = "{} x {} cells of {:g} m".format(*grid.free.shape, grid.resolution)
-    print(f"{map}: {size}", flush=True)
-    area = AREA if regions == "all" else None
+    rows, columns = grid.free.shape
+    print(f"{map}: {rows} x {columns} cells of {grid.resolution:g} m", flush=True)
     stages = (*skeleton.STAGES, "writing")
     with (
-        folder(out) as place,
+        folder(out) as out_dir,
         tqdm(total=len(stages), unit="stage", delay=0.5, mininterval=0) as bar,
     ):
 
-        def watch(stage: str) -> None:
+        def show_progress(stage: str) -> None:
             bar.set_description(stage, refresh=False)
             bar.update(stages.index(stage) - bar.n)
 
-        begin = perf_counter()
+        start = perf_counter()
         with named(str(map)):
-            survey = skeleton.survey(
-                **grid._asdict(), clearance=clearance, speck=speck, area=area, watch=watch
+            result = skeleton.survey(
+                grid.occupied,
+                grid.free,
+                resolution=grid.resolution,
+                origin=grid.origin,
+                clearance=clearance,
+                speck=speck,
+                area=AREA if regions == "all" else None,
+                watch=show_progress,
             )
-        seconds = {"run": perf_counter() - begin}
-        watch("writing")
-        numbers = report.of_map(survey) | {"clearance_m": clearance, "seconds": seconds}
-        write_json(place / "metrics.json", numbers)
-        report.write_map(place / "map.geojson", survey.graph)
-        graphml.write(place / "map.graphml", survey.graph)
-        report.draw_map(place / "map.png", grid, survey.graph)
+        seconds = {"run": perf_counter() - start}
+        show_progress("writing")
+        numbers = report.of_map(result) | {"clearance_m": clearance, "seconds": seconds}
+        write_json(out_dir / "metrics.json", numbers)
+        report.write_map(out_dir / "map.geojson", result.graph)
+        graphml.write(out_dir / "map.graphml", result.graph)
+        report.draw_map(out_dir / "map.png", grid, result.graph)
         bar.update()
-    report.tell_map(numbers, f"{map}: clearance {clearance:g} m, regions {survey.regions}", out)
+    title = f"{map}: robot radius {clearance:g} m, regions {result.regions}"
+    report.tell_map(numbers, title, out)
 
 
-def _watch(parts: Iterable[Track], runs: int) -> Track:
-    """All tracks of an experiment; shows how far it is, and its first result on a line."""
+def _collect(groups: Iterable[Track], runs: int) -> Track:
+    """All trials of an experiment, with a progress bar; print the errors of the first group."""
     done: list[Track] = []
     errors: list[np.ndarray] = []
-    with tqdm(total=runs, unit="run", desc="compiling", mininterval=0.5) as bar:
-        for part in parts:
-            done.append(part)
-            errors.append(report.error_of(part.estimate, part.truth))
+    with tqdm(total=runs, unit="trial", desc="compiling", mininterval=0.5) as bar:
+        for group in groups:
+            done.append(group)
+            errors.append(report.error_of(group.estimate, group.truth))
             rmse = monte_carlo.errors(np.concatenate(errors))["position_rmse_m"]
             if len(done) == 1:
-                blind = monte_carlo.errors(report.error_of(part.odometry, part.truth))[
-                    "position_rmse_m"
-                ]
+                odom_error = report.error_of(group.odometry, group.truth)
+                odom_rmse = monte_carlo.errors(odom_error)["position_rmse_m"]
                 bar.write(
-                    f"first {len(part.truth)} runs: position RMSE {rmse:.3f} m, "
-                    f"by dead reckoning {blind:.3f} m"
+                    f"first {len(group.truth)} trials: position RMSE {rmse:.3f} m, "
+                    f"by dead reckoning {odom_rmse:.3f} m"
                 )
                 bar.set_description("running")
             bar.set_postfix_str(f"position RMSE {rmse:.3f} m", refresh=False)
-            bar.update(len(part.truth))
+            bar.update(len(group.truth))
     return monte_carlo.collect(done)

@@ -1,9 +1,19 @@
-"""The covariance of a map (2 L, 2 L): an array, or one from which products are still to be taken.
+"""Covariance of a map of L landmarks, (2 L, 2 L): dense, or with its downdates deferred.
 
-An update takes the product of a few rows from all of a map that may be large. Put off, it costs
-little: what is asked of the covariance in between, a few of its rows, is worked out when it is
-asked, and many products are taken at once, as one of matrices. Nothing is approximated. There are
-no derivatives of a covariance that is put off.
+A Kalman update subtracts y^T y from the map's covariance, with few rows y (k, 2 L). For a large map
+this pass over the whole matrix is what an update costs. It can be postponed: the rows are stored,
+
+    P  =  base - rows^T rows,        base (2 L, 2 L),   rows (<= ROOM, 2 L)
+
+and an update appends its y to `rows`, which costs O(k L) instead of O(k L^2). What the filter reads
+of P in between is little, and is computed from the two parts when it is read:
+
+    rows of a few landmarks i     P[i] = base[i] - rows[:, i]^T rows     (`rows_at`)
+    2 x 2 blocks of landmarks     from running sums over `rows`           (`blocks_of`)
+
+When `rows` is full, it is subtracted from `base` as one matrix product, which is far faster than
+the same number of separate updates (`make_room`, `settle`). Nothing is approximated: P is the
+same up to rounding. A deferred covariance has no derivatives.
 
 References:
     Knight, Davison, Reid (2001), Towards constant time SLAM using postponement.
@@ -16,60 +26,89 @@ import numpy as np
 from jax import lax
 
 from jaxslam.linalg import add_products, lower
-from jaxslam.linalg import put_rows as put_in
+from jaxslam.linalg import put_rows as put_rows_dense
 from jaxslam.types import Array
 
 GUARD = 2  # units of rounding by which each update raises the variances
-LARGE = 256  # rows of a map above which it pays to leave zeros out
-STRIP = 192  # rows of a covariance that are worked on at a time
-ROOM = 96  # rows that are put off at most
+LARGE = 256  # rows of a map above which it pays to leave zero rows out
+STRIP = 192  # rows of the covariance that a flush works on at a time
+ROOM = 96  # capacity: deferred rows at most
 
 
 class Postponed(NamedTuple):
-    """A symmetric matrix `base` - `rows`^T `rows`; made by `postpone`, ended by `settle`."""
+    """A symmetric matrix P = `base` - `rows`^T `rows`; made by `postpone`, ended by `settle`.
 
-    base: Array  # (n, n)
-    rows: Array  # (ROOM, n) those that are put off, then zeros
-    sums: Array  # (2, n) over them: each number squared, and every second times the next
-    held: Array  # () int32 how many
-    updates: Array  # () in how many updates
+    Attributes:
+        base: (n, n) covariance before the deferred downdates; n = 2 L.
+        rows: (ROOM, n) deferred rows, in order; unused ones are zero.
+        sums: (2, n) running sums over the deferred rows r, for the diagonal blocks of
+            rows^T rows: sums[0, j] = sum of r[j]^2, sums[1, j] = sum of r[j] r[j + 1]. Of the
+            latter only even j are read, where j and j + 1 are the two numbers of one landmark.
+        held: () int32 how many of `rows` are used.
+        updates: () how many updates were deferred; each raises the variances by `GUARD` units of
+            rounding, which the flush applies.
+    """
+
+    base: Array
+    rows: Array
+    sums: Array
+    held: Array
+    updates: Array
 
 
 def postpone(cov: Array) -> Postponed:
-    """A covariance (n, n), from here on put off."""
-    none = jnp.zeros((ROOM + 2, len(cov)), cov.dtype)
-    return Postponed(cov, none[2:], none[:2], jnp.int32(0), jnp.zeros((), cov.dtype))
+    """A deferred covariance with nothing deferred yet, for a dense one (n, n)."""
+    zeros = jnp.zeros((ROOM + 2, len(cov)), cov.dtype)
+    return Postponed(cov, zeros[2:], zeros[:2], jnp.int32(0), jnp.zeros((), cov.dtype))
 
 
 def settle(cov: Array | Postponed) -> Array:
-    """The covariance (n, n), with nothing put off."""
+    """Flush: the dense covariance (n, n), with all deferred downdates applied."""
     if not isinstance(cov, Postponed):
         return cov
-    at = jnp.arange(len(cov.base), dtype=jnp.int32)
+    diagonal = jnp.arange(len(cov.base), dtype=jnp.int32)
     raised = 1 + GUARD * np.finfo(cov.base.dtype).eps * cov.updates
-    return _settled(cov.base, cov.rows).at[at, at].multiply(raised, unique_indices=True)
+    flushed = _subtract_product(cov.base, cov.rows)
+    return flushed.at[diagonal, diagonal].multiply(raised, unique_indices=True)
 
 
-def _settled(base: Array, rows: Array) -> Array:
-    """`base` - rows^T rows, a strip at a time in place, as far as any row is not zero."""
+def _subtract_product(base: Array, rows: Array) -> Array:
+    """`base` - rows^T rows, in place, one strip of `STRIP` rows of the result at a time.
+
+    Strips keep the product small enough for the cache, and those past the last landmark in use are
+    skipped: there all columns of `rows` are zero.
+
+        base    +---------+  strip 0
+                +---------+  strip 1
+                +---------+  ...             up to the last strip with a nonzero column of `rows`
+                +---------+  remainder       len(base) mod STRIP rows, always
+    """
     columns = rows.T
-    whole, rest = divmod(len(base), STRIP)
-    if rest:
-        base = base.at[-rest:].add(-columns[-rest:] @ rows)
-    if not whole:
+    num_strips, remainder = divmod(len(base), STRIP)
+    if remainder:
+        base = base.at[-remainder:].add(-columns[-remainder:] @ rows)
+    if not num_strips:
         return base
 
-    def strip(k: Array, now: Array) -> Array:
-        own = lambda x: lax.dynamic_slice_in_dim(x, k * STRIP, STRIP)
-        return lax.dynamic_update_slice_in_dim(now, own(now) - own(columns) @ rows, k * STRIP, 0)
+    def subtract_strip(strip: Array, result: Array) -> Array:
+        start = strip * STRIP
+        old = lax.dynamic_slice_in_dim(result, start, STRIP)
+        new = old - lax.dynamic_slice_in_dim(columns, start, STRIP) @ rows
+        return lax.dynamic_update_slice_in_dim(result, new, start, 0)
 
-    used = jnp.any(columns[: whole * STRIP].reshape(whole, -1) != 0.0, axis=1)
-    number = jnp.arange(1, whole + 1, dtype=jnp.int32)
-    return lax.fori_loop(0, jnp.max(jnp.where(used, number, 0)), strip, base)
+    used = jnp.any(columns[: num_strips * STRIP].reshape(num_strips, -1) != 0.0, axis=1)
+    strips_up_to = jnp.arange(1, num_strips + 1, dtype=jnp.int32)
+    num_used = jnp.max(jnp.where(used, strips_up_to, 0))
+    return lax.fori_loop(0, num_used, subtract_strip, base)
 
 
 def make_room(cov: Array | Postponed, more: int) -> Array | Postponed:
-    """The same, after which `more` rows can be put off."""
+    """The same covariance with capacity for `more` deferred rows: flushed if there is none.
+
+    Args:
+        cov: The covariance; a dense one is returned as it is.
+        more: Rows that will be deferred next, at most `ROOM`.
+    """
     if not isinstance(cov, Postponed):
         return cov
     full = cov.held + more > ROOM
@@ -77,75 +116,100 @@ def make_room(cov: Array | Postponed, more: int) -> Array | Postponed:
 
 
 def rows_at(cov: Array | Postponed, slot: Array) -> Array:
-    """Rows (K, 2, n) of the slots (K,)."""
+    """Rows (K, 2, n) of the covariance at the landmark slots (K,) int32."""
     if not isinstance(cov, Postponed):
         return cov.reshape(-1, 2, cov.shape[-1])[slot]
     base, size = rows_at(cov.base, slot), len(cov.base)
-    own = cov.rows.reshape(ROOM, -1, 2)[:, slot].reshape(ROOM, -1)
-    return base - (own.T @ cov.rows).reshape(-1, 2, size)
+    deferred_at_slot = cov.rows.reshape(ROOM, -1, 2)[:, slot].reshape(ROOM, -1)  # (ROOM, 2 K)
+    return base - (deferred_at_slot.T @ cov.rows).reshape(-1, 2, size)
 
 
 def blocks_of(cov: Array | Postponed) -> Array:
-    """The blocks (L, 2, 2) of each slot with itself."""
+    """The diagonal blocks (L, 2, 2): the covariance of each landmark."""
     if not isinstance(cov, Postponed):
         size = len(cov) // 2
         index = jnp.arange(size, dtype=jnp.int32)
         return cov.reshape(size, 2, size, 2)[index, :, index]
-    square, across = cov.sums.reshape(2, -1, 2).swapaxes(1, 2)
-    put_off = jnp.stack([square[0], across[0], across[0], square[1]], axis=-1)
-    return blocks_of(cov.base) - put_off.reshape(-1, 2, 2)
+    # Each (2, L): the sums at the first and at the second number of each landmark.
+    squares, products = cov.sums.reshape(2, -1, 2).swapaxes(1, 2)
+    deferred = jnp.stack([squares[0], products[0], products[0], squares[1]], axis=-1)
+    return blocks_of(cov.base) - deferred.reshape(-1, 2, 2)
 
 
 def subtract(cov: Array | Postponed, y: Array, seen: Array) -> Array | Postponed:
-    """Take y^T y, for rows y (k, n), and raise the variances a little if anything was `seen` ().
+    """Downdate by y^T y, and raise the variances by rounding if anything was observed.
 
-    In single precision P - Y^T Y alone is indefinite after some ten thousand steps where the map
-    learns nothing more: each loses half a unit of rounding.
+    In single precision P - y^T y alone becomes indefinite after some ten thousand updates that
+    carry no new information: each loses half a unit of rounding. The raise makes up for it.
 
     Args:
-        cov: The covariance; where it is put off, there must be room for the rows.
-        y: Rows of zeros stand for nothing.
-        seen: () bool.
+        cov: The covariance. A deferred one must have capacity for the rows that are not zero
+            (`make_room`), which is not checked.
+        y: (k, n); rows of zeros count for nothing.
+        seen: () bool, whether anything was observed.
     """
     if isinstance(cov, Postponed):
-        some = jnp.any(y != 0.0, axis=1)
-        first = y[jnp.argsort(~some, stable=True)]
-        rows = lax.dynamic_update_slice(cov.rows, first, (cov.held, jnp.int32(0)))
-        held = cov.held + jnp.sum(some, dtype=jnp.int32)
-        of_next = jnp.pad(y[:, 1:], ((0, 0), (0, 1)))
-        sums = cov.sums + jnp.stack([jnp.sum(y * y, axis=0), jnp.sum(y * of_next, axis=0)])
-        return Postponed(cov.base, rows, sums, held, cov.updates + seen.astype(y.dtype))
+        return _defer(cov, y, seen)
+    # Rows that count come first. Of a large map they are seldom more than half of all, and the
+    # pass over the matrix for the others is skipped when they are zero.
     half = len(y) // 2 if len(cov) > LARGE else len(y)
-    # Rows that count come first, and of a large map seldom are more than half of all.
     if half < len(y):
         cov = lower(cov, y[half:], jnp.any(y[half:] != 0.0))
-    return _guarded(add_products(cov, y[:half], y[:half], sign=-1), seen)
+    return _raise_variances(add_products(cov, y[:half], y[:half], sign=-1), seen)
 
 
-def _guarded(cov: Array, seen: Array) -> Array:
-    """The covariance with a little over its diagonal, if anything was `seen`."""
-    more, one = GUARD * np.finfo(cov.dtype).eps, jnp.ones((), cov.dtype)
+def _defer(cov: Postponed, y: Array, seen: Array) -> Postponed:
+    """Append the rows of y (k, n) that are not zero, and add to the running sums."""
+    nonzero = jnp.any(y != 0.0, axis=1)
+    # All k rows are written, nonzero ones first; the next call overwrites the zeros behind them.
+    nonzero_first = y[jnp.argsort(~nonzero, stable=True)]
+    rows = lax.dynamic_update_slice(cov.rows, nonzero_first, (cov.held, jnp.int32(0)))
+    held = cov.held + jnp.sum(nonzero, dtype=jnp.int32)
+    shifted = jnp.pad(y[:, 1:], ((0, 0), (0, 1)))  # r[j + 1] at j
+    sums = cov.sums + jnp.stack([jnp.sum(y * y, axis=0), jnp.sum(y * shifted, axis=0)])
+    return Postponed(cov.base, rows, sums, held, cov.updates + seen.astype(y.dtype))
+
+
+def _raise_variances(cov: Array, seen: Array) -> Array:
+    """The dense covariance with its diagonal times 1 + `GUARD` units of rounding, if `seen`."""
+    relative, one = GUARD * np.finfo(cov.dtype).eps, jnp.ones((), cov.dtype)
     if len(cov) > LARGE:
-        at = jnp.arange(len(cov), dtype=jnp.int32)
-        return cov.at[at, at].multiply(jnp.where(seen, one + more, one), unique_indices=True)
-    raised = 1 + more * np.eye(len(cov))  # a constant: half the cost, as long as it is small
+        diagonal = jnp.arange(len(cov), dtype=jnp.int32)
+        factor = jnp.where(seen, one + relative, one)
+        return cov.at[diagonal, diagonal].multiply(factor, unique_indices=True)
+    raised = 1 + relative * np.eye(len(cov))  # a constant: half the cost, as long as it is small
     return cov * jnp.where(seen, raised.astype(cov.dtype), one)
 
 
 def subtract_seldom(cov: Array | Postponed, y: Array, wanted: Array) -> Array | Postponed:
-    """Take y^T y for rows y (k, n) where `wanted` () bool; y is zero where it is not."""
+    """Downdate by y^T y that is rarely wanted; the variances are not raised.
+
+    Args:
+        cov: The covariance, with capacity for the rows if it is deferred.
+        y: (k, n); zero where not `wanted`.
+        wanted: () bool.
+    """
     if isinstance(cov, Postponed):
         return subtract(cov, y, jnp.bool_(False))
     return lower(cov, y, wanted)
 
 
 def put_rows(cov: Array | Postponed, rows: Array, at: Array) -> Array | Postponed:
-    """Replace some rows and columns, which is seldom wanted: `linalg.put_rows`."""
+    """Replace rows and columns, which is rarely wanted: `linalg.put_rows`.
+
+    In a deferred covariance the new rows go to `base`, and the deferred rows become zero in these
+    columns, so that `base` - rows^T rows has the new rows exactly.
+
+    Args:
+        cov: The covariance.
+        rows: (k, n) new rows, symmetric where rows and columns cross.
+        at: (k,) int32 index of each, n for nowhere; otherwise unique.
+    """
     if not isinstance(cov, Postponed):
-        return put_in(cov, rows, at)
-    how = {"mode": "drop", "unique_indices": True}
-    put_off = cov.rows.at[:, at].set(jnp.zeros((), rows.dtype), **how)
-    # Of either number of a slot, its product with the other.
-    both = jnp.stack([at, at - at % 2])
-    sums = cov.sums.at[jnp.arange(2, dtype=jnp.int32)[:, None], both].set(0.0, mode="drop")
-    return cov._replace(base=put_in(cov.base, rows, at), rows=put_off, sums=sums)
+        return put_rows_dense(cov, rows, at)
+    zero = jnp.zeros((), rows.dtype)
+    deferred = cov.rows.at[:, at].set(zero, mode="drop", unique_indices=True)
+    # Squares are kept at the number itself, products at the first number of its landmark.
+    cleared = jnp.stack([at, at - at % 2])
+    sums = cov.sums.at[jnp.arange(2, dtype=jnp.int32)[:, None], cleared].set(0.0, mode="drop")
+    return cov._replace(base=put_rows_dense(cov.base, rows, at), rows=deferred, sums=sums)

@@ -1,4 +1,22 @@
-"""How well the data determine the noise: standard errors of fitted parameters."""
+"""Standard errors of tuned noise parameters, from the curvature of the loss.
+
+Sandwich estimator. The parameters theta, logarithms of the noise, minimise the mean loss of B
+independent runs, (1/B) sum_b l_b(theta). With g_b the gradient of l_b at the true minimum theta_0,
+H the mean of the Hessians of l_b, and the mean gradient zero at the estimate theta,
+
+    0 = mean_b g_b + H (theta - theta_0)    =>    theta - theta_0 = -H^-1 mean_b g_b
+
+to first order. The mean gradient has the covariance J / B with J = mean_b g_b g_b^T, so
+
+    C = cov(theta) = H^-1 (J / B) H^-1
+
+This holds for any smooth loss. If the loss is the negative log-likelihood of a correct model then
+J = H, and C = H^-1 / B, the inverse Fisher information.
+
+Along an eigenvector v of H, with eigenvalue c, the variance is v^T C v = (v^T J v / B) / c^2. The
+data determine the direction if c > 0 and this is below 1: a standard error of theta below 1, a
+factor of e in the noise. H is inverted on the determined directions only.
+"""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -10,19 +28,27 @@ from jaxslam.losses import Loss, calibrated, check
 from jaxslam.monte_carlo import Log
 from jaxslam.slam import Config, Noise
 
-STEP = 0.1  # of a logarithm, by which curvature is measured
-SURE = 0.5  # relative standard error above which a parameter counts as not identifiable
-SHARE = 0.1  # part of a parameter in directions that the data say nothing of, likewise
+STEP = 0.1  # step of a logarithm for central differences of the gradient
+SURE = 0.5  # relative standard error from which a parameter counts as not identifiable
+SHARE = 0.1  # squared component in undetermined directions from which it does so, too
 
 
 class Errors(NamedTuple):
-    """Standard errors, of the logarithms: 0.1 is ten percent. P parameters."""
+    """Standard errors of the logarithms of P parameters: 0.1 is ten percent.
 
-    names: tuple[str, ...]  # (P,)
-    relative: np.ndarray  # (P,) standard error; NaN where frozen, inf where unknown
-    covariance: np.ndarray  # (P, P) of what is known; zero where frozen
-    identifiable: np.ndarray  # (P,) bool; False where frozen
-    warnings: tuple[str, ...]  # which free parameters the data do not tell, if any
+    Attributes:
+        names: (P,) names of the parameters.
+        relative: (P,) standard errors; NaN where frozen, inf where not determined.
+        covariance: (P, P) in the determined directions; zero where frozen.
+        identifiable: (P,) bool; False where frozen.
+        warnings: Messages about free parameters that are not identifiable; empty if all are.
+    """
+
+    names: tuple[str, ...]
+    relative: np.ndarray
+    covariance: np.ndarray
+    identifiable: np.ndarray
+    warnings: tuple[str, ...]
 
 
 def standard_errors(
@@ -33,21 +59,16 @@ def standard_errors(
     loss: Loss = calibrated,
     frozen: Collection[str] = (),
 ) -> Errors:
-    """Standard errors of a fit, from the curvature of its loss and how its runs disagree.
+    """Standard errors of tuned parameters by the sandwich estimator, C = H^-1 J H^-1 / B.
 
-        C = H^-1 J H^-1 / B
-
-    with H the mean over runs of the second derivatives, by central differences of the gradient,
-    and J that of the outer products of the gradients. It does not take the model for true.
-    Directions along which H is not positive, or too small beside J for a standard error below a
-    factor of e, are those of which the data say nothing.
+    The module's docstring derives it. The model need not be correct.
 
     Args:
-        noise: Where the mean loss over the runs is least, as `fit.tune` found it.
+        noise: Minimum of the mean loss over the runs, as `fit.tune` found it.
         config: Of the filter.
         logs: [B] runs that it was tuned on.
-        loss: By which.
-        frozen: Names of parameters that were not.
+        loss: The loss that it was tuned by.
+        frozen: Names of parameters, or fields of the noise, that were not tuned.
 
     Raises:
         ValueError: Fewer than two runs, or as `fit.tune`.
@@ -59,60 +80,79 @@ def standard_errors(
     runs = logs.motion.shape[0]
     if runs < 2:
         raise ValueError("standard errors need two runs or more")
-    h, each = second_derivatives(noise, config, logs, loss=loss, frozen=frozen)
-    return _errors(fit.names(noise), fit.free(noise, frozen), h, each.T @ each / len(each), runs)
+    hessian, gradients = second_derivatives(noise, config, logs, loss=loss, frozen=frozen)
+    outer = gradients.T @ gradients / len(gradients)
+    return _errors(fit.names(noise), fit.free(noise, frozen), hessian, outer, runs)
 
 
 def second_derivatives(
     noise: Noise, config: Config, logs: Log, *, loss: Loss, frozen: Collection[str] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean second derivatives (F, F) over runs in the F free parameters, as logarithms.
+    """Mean Hessian over runs in the F free parameters, by central differences of the gradient.
+
+    Args:
+        noise: Where to evaluate it.
+        config: Of the filter.
+        logs: [B] runs.
+        loss: The loss.
+        frozen: Names of parameters, or fields of the noise, that are not free.
 
     Returns:
-        They, and the gradients (G, F) of those runs that have one.
+        The Hessian (F, F), symmetric, of the logarithms of the parameters; and the gradients
+        (G, F) of the G runs whose loss and gradient are finite.
     """
-    at = np.flatnonzero(fit.free(noise, frozen))
-    values, each = fit.gradients(noise, config, logs, loss)
-    good = np.isfinite(values) & np.isfinite(each).all(axis=1)
+    indices = np.flatnonzero(fit.free(noise, frozen))
+    values, gradients = fit.gradients(noise, config, logs, loss)
+    good = np.isfinite(values) & np.isfinite(gradients).all(axis=1)
 
-    def slope(parameter: int, by: float) -> np.ndarray:
-        beside = fit.scaled(noise, parameter, by)
-        return fit.mean_gradient(*fit.gradients(beside, config, logs, loss))[1][at]
+    def gradient_beside(parameter: int, offset: float) -> np.ndarray:
+        beside = fit.scaled(noise, parameter, offset)
+        return fit.mean_gradient(*fit.gradients(beside, config, logs, loss))[1][indices]
 
-    h = np.stack([(slope(i, STEP) - slope(i, -STEP)) / (2 * STEP) for i in at])
-    return (h + h.T) / 2, each[good][:, at]
+    rows = [(gradient_beside(i, STEP) - gradient_beside(i, -STEP)) / (2 * STEP) for i in indices]
+    hessian = np.stack(rows)
+    return (hessian + hessian.T) / 2, gradients[good][:, indices]
 
 
-def _known(h: np.ndarray, j: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of curvature H and outer products J (F, F): what the data tell.
+def _invert_determined(
+    hessian: np.ndarray, outer: np.ndarray, runs: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Invert H on the directions that the data determine.
+
+    Args:
+        hessian: (F, F) H.
+        outer: (F, F) J.
+        runs: B.
 
     Returns:
-        Whether they tell of each direction (F,), the inverse (F, F) of H in those they do, and the
-        share (F,) of each parameter in the others.
+        The pseudo-inverse (F, F), and each parameter's squared component (F,) in the undetermined
+        directions, from 0 to 1.
     """
-    curvature, direction = np.linalg.eigh(h)
-    variance = np.einsum("ik,ij,jk->k", direction, j, direction) / runs
-    told = (curvature > 0.0) & (variance < curvature**2)
-    inverse = direction[:, told] / curvature[told] @ direction[:, told].T
-    return told, inverse, np.sum(direction[:, ~told] ** 2, axis=1)
+    curvature, direction = np.linalg.eigh(hessian)
+    gradient_variance = np.einsum("ik,ij,jk->k", direction, outer, direction) / runs
+    determined = (curvature > 0.0) & (gradient_variance < curvature**2)
+    kept = direction[:, determined]
+    inverse = kept / curvature[determined] @ kept.T
+    return inverse, np.sum(direction[:, ~determined] ** 2, axis=1)
 
 
 def _errors(
-    names: tuple[str, ...], moves: np.ndarray, h: np.ndarray, j: np.ndarray, runs: int
+    names: tuple[str, ...], trainable: np.ndarray, hessian: np.ndarray, outer: np.ndarray, runs: int
 ) -> Errors:
-    """Standard errors of H and J (F, F) of the free parameters."""
-    _, known, unknown = _known(h, j, runs)
-    own = known @ j @ known / runs
-    relative = np.where(unknown < SHARE, np.sqrt(np.diag(own)), np.inf)
-    sure = relative < SURE
+    """Standard errors of P parameters from H and J (F, F) of the F that are trainable (P,) bool."""
+    inverse, undetermined = _invert_determined(hessian, outer, runs)
+    own = inverse @ outer @ inverse / runs
+    own_relative = np.where(undetermined < SHARE, np.sqrt(np.diag(own)), np.inf)
 
-    size = len(moves)
-    covariance, whole = np.zeros((size, size)), np.full(size, np.nan)
-    covariance[np.ix_(moves, moves)] = own
-    whole[moves] = relative
+    size = len(trainable)
+    covariance, relative = np.zeros((size, size)), np.full(size, np.nan)
+    covariance[np.ix_(trainable, trainable)] = own
+    relative[trainable] = own_relative
     identifiable = np.zeros(size, bool)
-    identifiable[moves] = sure
-    lost = ", ".join(names[i] for i in np.flatnonzero(moves & ~identifiable))
+    identifiable[trainable] = own_relative < SURE
+    unidentifiable = [names[i] for i in np.flatnonzero(trainable & ~identifiable)]
+    if not unidentifiable:
+        return Errors(names, relative, covariance, identifiable, ())
     advice = "freeze some, or take more runs or another loss"
-    warnings = (f"not identifiable from these {runs} runs: {lost}; {advice}",) if lost else ()
-    return Errors(names, whole, covariance, identifiable, warnings)
+    warning = f"not identifiable from these {runs} runs: {', '.join(unidentifiable)}; {advice}"
+    return Errors(names, relative, covariance, identifiable, (warning,))

@@ -1,8 +1,12 @@
-"""Ways down a loss that is seen with its gradient, as optax has them.
+"""Optimisers for a loss that is evaluated together with its gradient, with optax's interface.
 
-Where every step sees the same runs, steps compare: L-BFGS finds its way along the narrow valleys
-between parameters that do nearly the same. A step that does not lead down is taken back, and a
-quarter of it tried. Where runs come in batches nothing compares: Adam.
+Where each step evaluates the same data, the losses of two steps are comparable: L-BFGS with
+backtracking, which follows the narrow valleys between strongly correlated parameters. With
+minibatches losses are not comparable: Adam.
+
+The usual line search (`optax.lbfgs`) evaluates the loss several times per step inside `update`.
+Here every evaluation runs the filter on all data, by a program of its own, so `careful` does one
+evaluation per `update` and spreads the line search over several of them.
 """
 
 from functools import cache
@@ -14,24 +18,40 @@ import optax
 
 from jaxslam.types import Array
 
-MEMORY = 10  # steps that L-BFGS remembers
-REACH = 0.4  # by which one of them changes a parameter at most
-RATE = 0.2  # first step of Adam
+MEMORY = 10  # pairs of steps and gradient differences that L-BFGS stores
+REACH = 0.4  # largest change of a parameter in one step
+RATE = 0.2  # initial learning rate of Adam
 
 
 class Trust(NamedTuple):
-    """State of `careful`: F parameters."""
+    """State of `careful`: F parameters.
 
-    inner: Any  # of L-BFGS, at the best point
-    value: Array  # () loss there, the least so far
-    theta: Array  # (F,) the best point
-    direction: Array  # (F,) from there on
-    reach: Array  # () greatest change of a parameter to try
+    Attributes:
+        inner: State of L-BFGS at the best point.
+        value: () loss at the best point, the least so far.
+        theta: (F,) the best point.
+        direction: (F,) search direction from there.
+        reach: () largest change of a parameter in the next step.
+    """
+
+    inner: Any
+    value: Array
+    theta: Array
+    direction: Array
+    reach: Array
 
 
 @cache
 def usual(steps: int, *, whole: bool) -> optax.GradientTransformationExtraArgs:
-    """`careful` where each step sees all runs, else Adam with a rate that decays to a tenth."""
+    """The default optimiser.
+
+    Args:
+        steps: Number of updates, over which Adam's learning rate decays to a tenth (cosine).
+        whole: Whether each step evaluates all data.
+
+    Returns:
+        `careful` if so, else Adam.
+    """
     if whole:
         return careful()
     rate = optax.cosine_decay_schedule(RATE, max(steps, 1), alpha=0.1)
@@ -40,29 +60,55 @@ def usual(steps: int, *, whole: bool) -> optax.GradientTransformationExtraArgs:
 
 @cache
 def careful() -> optax.GradientTransformationExtraArgs:
-    """L-BFGS that goes on from the least value that it has seen; `update` wants the `value`."""
-    newton = optax.scale_by_lbfgs(memory_size=MEMORY)
+    """L-BFGS with backtracking to the best point; its `update` needs the `value` of the loss.
+
+    The caller evaluates loss f and gradient g at a trial point x and calls `update(g, state, x,
+    value=f)`, which returns the step from x to the next trial point. The state is the best point
+    x*, with its loss f*, a search direction d from it and a bound r on the change of any parameter:
+
+        start:  f* = inf, x* = x, d = 0, r = REACH
+
+        f < f*, accepted:                         f >= f* or NaN, rejected:
+            x*, f* <- x, f                            x*, f*, d and L-BFGS stay as they are
+            d <- L-BFGS direction from g              r <- min(r, max|d|) / 4
+            r <- min(2 r, REACH)                           (a quarter of the step that failed)
+
+        in both cases the next trial point is  x* + d min(1, r / max|d|)
+
+    A direction of L-BFGS that does not descend (g . d >= 0) is replaced by the negative gradient,
+    scaled to a largest change of REACH. The first evaluation is always accepted if it is finite.
+    """
+    lbfgs = optax.scale_by_lbfgs(memory_size=MEMORY)
 
     def init(theta: Array) -> Trust:
-        most = jnp.full((), REACH, theta.dtype)
-        none = jnp.full((), jnp.inf, theta.dtype)
-        return Trust(newton.init(theta), none, theta, jnp.zeros_like(theta), most)
+        reach = jnp.full((), REACH, theta.dtype)
+        value = jnp.full((), jnp.inf, theta.dtype)
+        return Trust(lbfgs.init(theta), value, theta, jnp.zeros_like(theta), reach)
+
+    def accept(gradient: Array, state: Trust, theta: Array, value: Array) -> Trust:
+        scaled, inner = lbfgs.update(gradient, state.inner, theta)
+        steepest = -gradient * (REACH / _or_one(jnp.max(jnp.abs(gradient))))
+        direction = jnp.where(jnp.vdot(scaled, gradient) > 0.0, -scaled, steepest)
+        reach = jnp.minimum(2.0 * state.reach, REACH)
+        return Trust(inner, value.astype(theta.dtype), theta, direction, reach)
+
+    def reject(state: Trust) -> Trust:
+        failed = jnp.minimum(state.reach, jnp.max(jnp.abs(state.direction)))
+        return state._replace(reach=failed / 4.0)
 
     def update(
-        slope: Array, state: Trust, theta: Array, *, value: Array, **_: Any
+        gradient: Array, state: Trust, theta: Array, *, value: Array, **extra_args: Any
     ) -> tuple[Array, Trust]:
-        step, inner = newton.update(slope, state.inner, theta)
-        steep = jnp.max(jnp.abs(slope))
-        straight = -slope * (REACH / jnp.where(steep > 0.0, steep, 1.0))
-        direction = jnp.where(jnp.vdot(step, slope) > 0.0, -step, straight)
-        wider = jnp.minimum(2.0 * state.reach, REACH)
-        down = Trust(inner, value.astype(theta.dtype), theta, direction, wider)
-        tried = jnp.minimum(state.reach, jnp.max(jnp.abs(state.direction)))
-        up = state._replace(reach=tried / 4.0)
+        del extra_args  # optax passes them to all transformations of a chain
         better = value < state.value
-        state = jax.tree.map(lambda a, b: jnp.where(better, a, b), down, up)
-        longest = jnp.max(jnp.abs(state.direction))
-        part = jnp.minimum(1.0, state.reach / jnp.where(longest > 0.0, longest, 1.0))
-        return state.theta + part * state.direction - theta, state
+        choices = accept(gradient, state, theta, value), reject(state)
+        state = jax.tree.map(lambda x, y: jnp.where(better, x, y), *choices)
+        fraction = jnp.minimum(1.0, state.reach / _or_one(jnp.max(jnp.abs(state.direction))))
+        return state.theta + fraction * state.direction - theta, state
 
     return optax.GradientTransformationExtraArgs(init, update)
+
+
+def _or_one(x: Array) -> Array:
+    """`x` where it is positive, else 1, to divide by."""
+    return jnp.where(x > 0.0, x, 1.0)

@@ -1,7 +1,7 @@
-"""What the fronts of the automaton start from: edge codes (the paper) or straight runs (default).
+"""Sources of the Voronoi automaton in a scan: edge codes (paper) or straight segments (default).
 
-Edge codes label each boundary cell by the pattern of its neighbours; a run is a stretch of one
-straight wall, found in the order of the beams, with its line fit.
+Edge codes label each boundary cell by the pattern of its neighbours (`codes`). A segment is one
+straight piece of wall, found in the order of the beams, with its line fit (`runs`).
 """
 
 from typing import NamedTuple
@@ -24,9 +24,13 @@ _CODES = (1, _SIDE, 2, 5, _SIDE, _SIDE, 5, 3, 2, 6, 2, 2, 6, 4, 2, 0)
 def codes(grid: Grid, spec: GridSpec) -> Array:
     """Edge code (H, W) uint8 of each cell: 1..6 for e1..e6, 0 for no edge.
 
-    e1 is an isolated cell: salt-and-pepper noise. e3 and e4 share a pattern and are told apart by
-    the side of the sensor axis they lie on. Patterns that face away from the sensor cannot be
-    seen by it and count as the one they mirror.
+    e1 is an isolated cell: salt-and-pepper noise. e3 and e4 share a pattern and differ by the side
+    of the sensor axis they lie on. Patterns that face away from the sensor cannot be seen by it
+    and count as the one they mirror.
+
+    Args:
+        grid: The local grid of a scan.
+        spec: Its extent.
 
     Raises:
         ValueError: The grid has another shape or type than `spec` says; while tracing.
@@ -50,24 +54,41 @@ def code_bits(codes: Array) -> Array:
 
 
 class Runs(NamedTuple):
-    """Straight runs of a scan in the order of its beams (counter-clockwise), padded to K."""
+    """Straight wall segments of a scan, counter-clockwise in the order of its beams, padded to K.
 
-    normal: Array  # (K, 2) unit normal, robot frame; the robot is on its positive side
-    centre: Array  # (K, 2) [m] weighted mean of the points, on the line, robot frame
-    ends: Array  # (K, 2, 2) [m] first and last end, robot frame
-    end_cov: Array  # (K, 2, 2, 2) [m^2] covariance of the ends
-    real: Array  # (K, 2) bool, the wall itself ends there (not the view of it)
-    sharp: Array  # (K, 2) bool, it ends before something further away: what it hides is unseen
-    offset_variance: Array  # (K,) [m^2] of the line across itself, at `centre`
-    angle_variance: Array  # (K,) [rad^2] of its direction
-    count: Array  # (K,) int32 number of beams
-    meets: Array  # (K,) bool, this run meets the next one in a corner, at `ends[:, 1]`
-    valid: Array  # (K,) bool
-    of_beam: Array  # (R,) int32 run of each beam, K for none
+    Robot frame throughout. See `runs` for a figure.
+
+    Attributes:
+        normal: (K, 2) unit normal of the line, towards the robot.
+        centre: (K, 2) [m] weighted mean of the points, on the line.
+        ends: (K, 2, 2) [m] first and last end.
+        end_cov: (K, 2, 2, 2) [m^2] covariance of each end.
+        real: (K, 2) bool, the wall itself ends there, not only the view of it.
+        sharp: (K, 2) bool, occluding end: what lies behind it is hidden by the wall.
+        offset_variance: (K,) [m^2] variance of the line across itself, at `centre`.
+        angle_variance: (K,) [rad^2] variance of its direction.
+        count: (K,) int32 number of beams.
+        meets: (K,) bool, this segment meets the next one in a corner, at `ends[:, 1]`.
+        valid: (K,) bool, False for padding and for the slot of all surplus segments.
+        of_beam: (R,) int32 segment of each beam, K for none.
+    """
+
+    normal: Array
+    centre: Array
+    ends: Array
+    end_cov: Array
+    real: Array
+    sharp: Array
+    offset_variance: Array
+    angle_variance: Array
+    count: Array
+    meets: Array
+    valid: Array
+    of_beam: Array
 
     @property
     def along(self) -> Array:
-        """Unit vectors (K, 2) from the first end to the last: counter-clockwise around."""
+        """Unit vectors (K, 2) from first to last end: counter-clockwise around the robot."""
         return jnp.stack([self.normal[..., 1], -self.normal[..., 0]], axis=-1)
 
     @property
@@ -81,75 +102,179 @@ class Runs(NamedTuple):
 
 
 class RunSpec(NamedTuple):
-    """How scans are cut into runs; static under jit."""
+    """Parameters of the segmentation of scans; static under jit.
 
-    capacity: int = 31  # K, one label bit each, and one for the automaton
-    gap: float = 0.2  # [m] a step between beams below this is no jump
-    price: float = 20.0  # squared standard deviations that a run must explain to be one
-    outlier: float = 16.0  # squared standard deviations that one beam may count
-    lanes: int = 16  # runs that are followed together
-    uneven: float = 0.02  # [m] by which walls step in and out and are still one run
-    grain: float = 0.03  # [m] length of wall over which they do so together
-    rough: float = 0.002  # [m] by which points leave a line whatever their number, in its fit
-    corner: float = 0.15  # [m] how far the ends of two runs that meet may be from their corner
+    Attributes:
+        capacity: K, most segments; one label bit each, and one for the automaton.
+        gap: [m] two successive hits nearer to each other than this are never a jump.
+        price: Cost of a segment, in squared standard deviations.
+        outlier: Bound of the cost of one beam, in squared standard deviations.
+        lanes: Candidates that the partition keeps at each beam.
+        uneven: [m] standard deviation of a wall about its line that does not split it.
+        grain: [m] length of wall over which that deviation is the same.
+        rough: [m] standard deviation added to each point in the line fit.
+        corner: [m] distance at most from the ends of two adjacent segments to their corner.
+    """
+
+    capacity: int = 31
+    gap: float = 0.2
+    price: float = 20.0
+    outlier: float = 16.0
+    lanes: int = 16
+    uneven: float = 0.02
+    grain: float = 0.03
+    rough: float = 0.002
+    corner: float = 0.15
+
+
+class _Pieces(NamedTuple):
+    """Pieces of a scan between its cuts; those with most beams have a slot 0..K-1 each.
+
+    Attributes:
+        spans: (K,) first and last beam.
+        of_beam: (R,) int32 slot of each beam, K for none.
+        valid: (K,) bool.
+        fitted: (K,) bool, valid and of three beams or more: a line is fitted.
+        overflow: () bool, there are more pieces than slots.
+        surplus: () int32 slot of the fewest beams; if there are more pieces, it takes these too.
+    """
+
+    spans: lines.Spans
+    of_beam: Array
+    valid: Array
+    fitted: Array
+    overflow: Array
+    surplus: Array
+
+
+class _EndBeams(NamedTuple):
+    """First and last beam of each piece.
+
+    Attributes:
+        first: (K,) int32 first beam.
+        last: (K,) int32 last beam.
+        x: (K, 2) [m] of the hits.
+        y: (K, 2) [m] of the hits.
+        ranges: (K, 2) [m].
+        range_beyond: (K, 2) [m] of the next beam outside the piece; 0 outside the field of view.
+        jump: (K, 2) 1.0 if a jump is between the two, else 0.0.
+        normal: (K, 2) of the line that the partition fitted.
+    """
+
+    first: Array
+    last: Array
+    x: Array
+    y: Array
+    ranges: Array
+    range_beyond: Array
+    jump: Array
+    normal: Array
+
+
+class _Line(NamedTuple):
+    """Lines of K pieces, by coordinates: n = (nx, ny) towards the robot, c = (cx, cy) the centre.
+
+    The direction is u = (ny, -nx). `offset_variance` and `angle_variance` are those of `Runs`.
+    """
+
+    nx: Array
+    ny: Array
+    cx: Array
+    cy: Array
+    offset_variance: Array
+    angle_variance: Array
+    centre: Array
+
+    def coordinate(self, x: Array, y: Array) -> Array:
+        """Position (K, 2) [m] of points (K, 2) along their line: u (p - c)."""
+        cx, cy = self.cx[:, None], self.cy[:, None]
+        return (x - cx) * self.ny[:, None] - (y - cy) * self.nx[:, None]
+
+
+class _Ends(NamedTuple):
+    """Ends of pieces, (K,) or (K, 2): position [m], and entries xx, xy, yy of the covariance."""
+
+    x: Array
+    y: Array
+    cov_xx: Array
+    cov_xy: Array
+    cov_yy: Array
 
 
 def jumps(scan: Scan, lidar: Lidar, spec: RunSpec) -> Array:
     """Whether the wall is interrupted before each beam (R,) bool.
 
     On a straight wall, however grazing, 1 / r is a sinusoid of the bearing, so that
-    1/r[i+1] + 1/r[i-1] = 2 cos(step) / r[i]. A wide step between two beams is no jump when the
-    two beams on either side of it predict it.
+    1 / r[i+1] + 1 / r[i-1] = 2 cos(step) / r[i]. Two successive hits that are far apart are no jump
+    if the two beams before them predict the second, or the two after them the first.
     """
     r = scan.ranges
     xy = points(scan, lidar)
     x, y = xy[:, 0], xy[:, 1]
-    wide = _size(x - jnp.roll(x, 1), y - jnp.roll(y, 1)) > spec.gap
+    wide = _length(x - jnp.roll(x, 1), y - jnp.roll(y, 1)) > spec.gap
     twice = 2 * jnp.cos(jnp.asarray(lidar.step, r.dtype))
 
-    def astray(far: Array, near: Array, there: Array) -> Array:
-        inverse = twice / near - 1.0 / far
-        guess = jnp.where(inverse > 0.0, 1.0 / jnp.maximum(inverse, 1e-6), jnp.inf)
-        # A wall that steps in or out does so by the more along a beam, the more it is grazed.
-        slant = _size(near - far, near * lidar.step) / (near * lidar.step)
-        return jnp.abs(guess - there) - 2.0 * spec.uneven * slant
+    def prediction_error(second: Array, nearest: Array, measured: Array) -> Array:
+        """Error [m] of a range from the nearest beam and the second, less what is uneven."""
+        inverse = twice / nearest - 1.0 / second
+        predicted = jnp.where(inverse > 0.0, 1.0 / jnp.maximum(inverse, 1e-6), jnp.inf)
+        # An offset of the wall changes a range by 1 / cos(angle of incidence) times as much.
+        slant = _length(nearest - second, nearest * lidar.step) / (nearest * lidar.step)
+        return jnp.abs(predicted - measured) - 2.0 * spec.uneven * slant
 
     # Beam i from i-1 and i-2, and beam i-1 from i and i+1.
-    later = astray(jnp.roll(r, 2), jnp.roll(r, 1), r)
-    earlier = astray(jnp.roll(r, -1), r, jnp.roll(r, 1))
-    # Two readings of noise s extrapolate with about 2.2 s; a far wall may also bend a little.
+    forward = prediction_error(jnp.roll(r, 2), jnp.roll(r, 1), r)
+    backward = prediction_error(jnp.roll(r, -1), r, jnp.roll(r, 1))
+    # Two ranges of noise s extrapolate with about 2.2 s; a far wall may also bend a little.
     tolerance = 5.0 * lidar.noise + 0.05 * jnp.abs(r - jnp.roll(r, 1))
-    smooth = (later < tolerance) | (earlier < tolerance)
+    smooth = (forward < tolerance) | (backward < tolerance)
     broken = ~scan.hit | ~jnp.roll(scan.hit, 1) | (wide & ~smooth)
     return broken.at[0].set(True)
 
 
-def _size(x: Array, y: Array) -> Array:
+def _length(x: Array, y: Array) -> Array:
+    """Length of vectors, at least 1e-6, with finite derivatives."""
     return jnp.sqrt(jnp.maximum(x * x + y * y, 1e-12))
 
 
-def _of_beams(scan: Scan, lidar: Lidar, jump: Array, normal: Array) -> Array:
-    """What runs want to know of the beams they end at, (R, 9), so that it is looked up at once.
-
-    x and y of the hit, normal (2), range, and of the beam before and after: range and jump between.
-    """
-    r, jump = scan.ranges, jump.astype(scan.ranges.dtype)
-    before = jnp.stack([jnp.roll(r, 1), jump], axis=1)
-    after = jnp.stack([jnp.roll(r, -1), jnp.append(jump[1:], 1.0)], axis=1)
-    # Nothing is beyond the first and the last beam: a wall does not end there, its view does.
-    before, after = before.at[0].set(0.0), after.at[-1, 0].set(0.0)
-    return jnp.concatenate([points(scan, lidar), normal, r[:, None], before, after], axis=1)
-
-
 def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
-    """Straight runs of a scan, in the order of its beams.
+    """Straight wall segments of a scan, in the order of its beams.
 
-    The scan is broken at jumps, and cut where straight lines explain it best. Each point counts
-    by its noise across the line, which is small for grazing beams. Two runs that meet end in the
-    intersection of their lines. Where there are more runs than `capacity`, those with the fewest
-    beams share one label: they are obstacles, told apart no more.
+    Two segments seen by the robot R, 0 and 1, counter-clockwise:
+
+          ==========  wall further away
+                .
+                 .  beam beyond the end
+                  .
+        ends[1, 1]  o-----------------------+  ends[1, 0] = ends[0, 1]
+        occluding    .      normal[1]       |  a corner: meets[0], both ends real
+        end: sharp    .         |           |
+        and real       .        v           |
+                        .                   |  ^
+                         R    normal[0] <-- |  | along[0]
+                                            o  ends[0, 0]
+                                               only the view ends here: not real
+
+    Steps:
+
+    1. Split the beams at jumps and where straight lines explain them best (`lines.partition`).
+    2. Give the pieces with most beams a slot each (`_longest_pieces`). If there are more than
+       `capacity`, the slot of the fewest beams takes all others too, and is not valid: its beams
+       are obstacles without a line.
+    3. Fit a line to each by weighted total least squares (`_fit_lines`).
+    4. Project the outermost hits onto the lines (`_project_ends`).
+    5. Intersect the lines of adjacent segments: corners (`_corners`).
+    6. Classify the other ends; an occluding end is half a beam beyond its hit (`_free_ends`).
+
+    Args:
+        scan: The scan.
+        lidar: Its scanner.
+        spec: Parameters.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
     """
-    xy, capacity = points(scan, lidar), spec.capacity
+    xy = points(scan, lidar)
     jump = jumps(scan, lidar, spec)
     noise = max(lidar.noise, 0.005)
     cut = lines.partition(
@@ -163,117 +288,272 @@ def runs(scan: Scan, lidar: Lidar, spec: RunSpec) -> Runs:
         uneven=spec.uneven,
         grain=spec.grain,
     )
-    spans = lines.longest(cut.begins, scan.hit, capacity=capacity)
-    fewest = jnp.argmin(spans.size).astype(jnp.int32)
-    overflow = jnp.sum(cut.begins & scan.hit, dtype=jnp.int32) > capacity
-    slot = jnp.arange(capacity, dtype=jnp.int32)
-    own = ~(overflow & (slot == fewest))
-    count, valid, fitted = spans.size, own & (spans.size > 0), own & (spans.size >= 3)
-    first, last = jnp.minimum(spans.first, lidar.beams - 1), jnp.maximum(spans.last, 0)
-    ends = _of_beams(scan, lidar, jump, cut.normal)[jnp.stack([first, last], axis=1)]
+    pieces = _longest_pieces(cut.begins, scan.hit, spec.capacity)
+    end_beams = _end_beams(scan.ranges, xy, jump, cut.normal, pieces.spans)
+    line = _fit_lines(xy, unit(bearings(lidar)).astype(xy.dtype), pieces, end_beams, noise, spec)
+    x, y = _project_ends(end_beams, line, pieces.fitted)
+    adjacent = _adjacent(pieces.spans, end_beams)
+    corner, meets = _corners(line, x, y, adjacent, pieces.fitted, noise, lidar, spec)
+    free, occluding = _free_ends(line, x, y, end_beams, pieces.fitted, lidar)
 
-    of = spans.of_beam(lidar.beams)
-    beam = jnp.arange(lidar.beams, dtype=jnp.int32)
-    trim = jnp.where(count >= 6, 1, 0)
-    mine = lambda x: x.at[of].get(mode="clip")
-    inner = mine(jnp.stack([first + trim, last - trim], axis=1))
-    inner = (of < capacity) & (beam >= inner[:, 0]) & (beam <= inner[:, 1])
-    slant = dot(mine(ends[:, 1, 2:4]), unit(bearings(lidar)).astype(xy.dtype))
-    weight = jnp.where(inner, 1.0 / ((noise * slant) ** 2 + spec.rough**2), 0.0)
-    sums = lines.moments(xy, weight, of, lines=capacity)
-    normal, across, spread = lines.principal(sums.scatter)
-    cx, cy = sums.mean[:, 0], sums.mean[:, 1]
-    sign = jnp.where(dot(normal, sums.mean) > 0.0, -1.0, 1.0)
-    nx, ny = sign * normal[:, 0], sign * normal[:, 1]
-    # The residuals scale the variances, four of them are taken as expected.
-    degrees = jnp.maximum(count - 2 * trim - 2, 0).astype(xy.dtype)
-    scale = (4.0 + across) / (4.0 + degrees)
-    offset_variance = scale / jnp.maximum(sums.weight, 1e-9)
-    angle_variance = scale / jnp.maximum(spread, 1e-6)
-
-    # Ends on the line (ny, -nx): of its points, and of the next line, of which it is a turn away.
-    x, y = ends[:, :, 0], ends[:, :, 1]  # (K, 2)
-    part = (x - cx[:, None]) * ny[:, None] - (y - cy[:, None]) * nx[:, None]
-    x = jnp.where(fitted[:, None], cx[:, None] + part * ny[:, None], x)
-    y = jnp.where(fitted[:, None], cy[:, None] - part * nx[:, None], y)
-    of_next = [nx, ny, cx, cy, offset_variance, angle_variance, x[:, 0], y[:, 0]]
-    mx, my, dx, dy, next_offset, next_angle, next_x, next_y = jnp.roll(jnp.stack(of_next), -1, 1)
-    turn = nx * my - ny * mx
-    safe = jnp.where(jnp.abs(turn) > 0.1, turn, 1.0)
-    reach = ((dx - cx) * mx + (dy - cy) * my) / safe
-    corner_x, corner_y = cx - ny * reach, cy + nx * reach
-    slack = spec.corner + 3 * noise / jnp.maximum(jnp.abs(turn), 0.3)
-    slack += 2 * lidar.step * _size(corner_x, corner_y)
-    close = _size(corner_x - x[:, 1], corner_y - y[:, 1]) < slack
-    close &= _size(corner_x - next_x, corner_y - next_y) < slack
-    next_first, next_fitted = jnp.roll(spans.first, -1), jnp.roll(fitted, -1)
-    beside = (slot < capacity - 1) & (spans.last + 1 == next_first) & (ends[:, 1, 8] == 0.0)
-    meets = beside & fitted & next_fitted & (jnp.abs(turn) > 0.3) & close
-
-    # An end is real where another run begins, and on the near side of a jump; there the wall goes
-    # on for about half a beam more than was seen of it.
-    away = _size(x, y)
-    grazing = jnp.abs(nx[:, None] * x + ny[:, None] * y) / jnp.maximum(away, 1e-6)
-    room = 0.5 * lidar.step * away / jnp.maximum(grazing, 0.1)
-    beyond = jnp.stack([ends[:, 0, 5], ends[:, 1, 7]], axis=1)
-    sharp = jnp.stack([ends[:, 0, 6], ends[:, 1, 8]], axis=1) > 0.0
-    sharp &= ends[:, :, 4] < jnp.minimum(beyond, 0.9 * lidar.reach)
-    further = jnp.where(sharp & fitted[:, None], room, 0.0) * jnp.array([-1.0, 1.0], x.dtype)[None]
-    x, y = x + ny[:, None] * further, y - nx[:, None] * further
-
-    # Of a corner, the inverse of the matrix of the two normals maps the errors of the lines.
-    part = (corner_x - dx) * my - (corner_y - dy) * mx
-    ahead = (part**2 * next_angle + next_offset) / safe**2
-    here = (reach**2 * angle_variance + offset_variance) / safe**2
-    of_corner = [
-        corner_x,
-        corner_y,
-        here * my * my + ahead * ny * ny,
-        -here * my * mx - ahead * ny * nx,
-        here * mx * mx + ahead * nx * nx,
-        meets.astype(x.dtype),
-    ]
-    of_corner = jnp.stack(of_corner)
-    of_corner = jnp.stack([jnp.roll(of_corner, 1, axis=1), of_corner], axis=2)  # (6, K, 2)
-    part = (x - cx[:, None]) * ny[:, None] - (y - cy[:, None]) * nx[:, None]
-    thin = offset_variance[:, None] + part**2 * angle_variance[:, None]
-    long = thin + room**2 / 3
-    u, v = nx[:, None], ny[:, None]
-    of_end = [x, y, thin * u * u + long * v * v, (thin - long) * u * v, thin * v * v + long * u * u]
-    x, y, xx, cov_xy, yy = jnp.where(of_corner[5:] > 0.0, of_corner[:5], jnp.stack(of_end))
+    # The corner of segments k and k + 1 is the last end of k and the first of k + 1.
+    at_corner = jnp.stack([*corner, meets.astype(x.dtype)])
+    at_corner = jnp.stack([jnp.roll(at_corner, 1, axis=1), at_corner], axis=2)  # (6, K, 2)
+    ends = _Ends(*jnp.where(at_corner[5:] > 0.0, at_corner[:5], jnp.stack(free)))
+    cov = jnp.stack([ends.cov_xx, ends.cov_xy, ends.cov_xy, ends.cov_yy], axis=2)
+    surplus_beam = scan.hit & (pieces.of_beam == spec.capacity) & pieces.overflow
     return Runs(
-        normal=jnp.stack([nx, ny], axis=1),
-        centre=sums.mean,
-        ends=jnp.stack([x, y], axis=2),
-        end_cov=jnp.stack([xx, cov_xy, cov_xy, yy], axis=2).reshape(capacity, 2, 2, 2),
-        real=sharp | jnp.stack([jnp.roll(beside, 1), beside], axis=1),
-        sharp=sharp,
-        offset_variance=offset_variance,
-        angle_variance=angle_variance,
-        count=count,
+        normal=jnp.stack([line.nx, line.ny], axis=1),
+        centre=line.centre,
+        ends=jnp.stack([ends.x, ends.y], axis=2),
+        end_cov=cov.reshape(spec.capacity, 2, 2, 2),
+        real=occluding | jnp.stack([jnp.roll(adjacent, 1), adjacent], axis=1),
+        sharp=occluding,
+        offset_variance=line.offset_variance,
+        angle_variance=line.angle_variance,
+        count=pieces.spans.size,
         meets=meets,
-        valid=valid,
-        of_beam=jnp.where(scan.hit & (of == capacity) & overflow, fewest, of),
+        valid=pieces.valid,
+        of_beam=jnp.where(surplus_beam, pieces.surplus, pieces.of_beam),
     )
 
 
-def run_cells(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int = 6) -> Array:
-    """Run (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
+def _longest_pieces(begins: Array, hit: Array, capacity: int) -> _Pieces:
+    """The `capacity` pieces with most beams; `begins` and `hit` (R,) as of `lines.longest`."""
+    spans = lines.longest(begins, hit, capacity=capacity)
+    fewest = jnp.argmin(spans.size).astype(jnp.int32)
+    overflow = jnp.sum(begins & hit, dtype=jnp.int32) > capacity
+    own = ~(overflow & (jnp.arange(capacity, dtype=jnp.int32) == fewest))
+    return _Pieces(
+        spans=spans,
+        of_beam=spans.of_beam(hit.size),
+        valid=own & (spans.size > 0),
+        fitted=own & (spans.size >= 3),
+        overflow=overflow,
+        surplus=fewest,
+    )
+
+
+def _end_beams(
+    ranges: Array, xy: Array, jump: Array, normal: Array, spans: lines.Spans
+) -> _EndBeams:
+    """First and last beam of each piece and what is beside them, by one gather.
 
     Args:
-        scan: The scan the runs are of.
-        lidar: The scanner.
-        runs: Its runs; where two share a cell, the later has it.
-        spec: The grid to draw on.
-        fill: Points drawn from each hit to the next of the same run.
+        ranges: (R,) [m].
+        xy: (R, 2) [m] hits.
+        jump: (R,) bool, of `jumps`.
+        normal: (R, 2), of `lines.Partition`.
+        spans: (K,) first and last beams.
     """
-    xy, of = points(scan, lidar), runs.of_beam
+    jump = jump.astype(ranges.dtype)
+    before = jnp.stack([jnp.roll(ranges, 1), jump], axis=1)
+    after = jnp.stack([jnp.roll(ranges, -1), jnp.append(jump[1:], 1.0)], axis=1)
+    # Range 0 outside the field of view: no wall ends there, only the view of it.
+    before, after = before.at[0].set(0.0), after.at[-1, 0].set(0.0)
+    table = jnp.concatenate([xy, normal, ranges[:, None], before, after], axis=1)
+    first, last = jnp.minimum(spans.first, ranges.size - 1), jnp.maximum(spans.last, 0)
+    beams = table[jnp.stack([first, last], axis=1)]  # (K, 2, 9)
+    return _EndBeams(
+        first=first,
+        last=last,
+        x=beams[:, :, 0],
+        y=beams[:, :, 1],
+        ranges=beams[:, :, 4],
+        range_beyond=jnp.stack([beams[:, 0, 5], beams[:, 1, 7]], axis=1),
+        jump=jnp.stack([beams[:, 0, 6], beams[:, 1, 8]], axis=1),
+        normal=beams[:, 1, 2:4],
+    )
+
+
+def _fit_lines(
+    xy: Array, ray: Array, pieces: _Pieces, end_beams: _EndBeams, noise: float, spec: RunSpec
+) -> _Line:
+    """Weighted total least squares: one line for each piece.
+
+    A range error e moves a point by e cos(incidence) across the wall, so grazing beams count more:
+    weight = 1 / ((noise cos)^2 + rough^2). Of six beams or more the outermost two do not count:
+    they may be mixed pixels. With W the sum of the weights and S that of weight times the squared
+    coordinate along the line, the variances are scale / W of the offset and scale / S of the angle.
+    The scale is the reduced chi-square, with four more degrees of freedom at their expectation.
+
+    Args:
+        xy: (R, 2) [m] hits.
+        ray: (R, 2) unit vectors of the beams.
+        pieces: The pieces.
+        end_beams: Their outermost beams.
+        noise: [m] standard deviation of a range.
+        spec: Parameters.
+    """
+    count, of_beam = pieces.spans.size, pieces.of_beam
+    trim = jnp.where(count >= 6, 1, 0)
+    inner = jnp.stack([end_beams.first + trim, end_beams.last - trim], axis=1)
+    inner = inner.at[of_beam].get(mode="clip")  # (R, 2)
+    beam = jnp.arange(of_beam.size, dtype=jnp.int32)
+    used = (of_beam < spec.capacity) & (beam >= inner[:, 0]) & (beam <= inner[:, 1])
+    cos_incidence = dot(end_beams.normal.at[of_beam].get(mode="clip"), ray)
+    weight = jnp.where(used, 1.0 / ((noise * cos_incidence) ** 2 + spec.rough**2), 0.0)
+    sums = lines.moments(xy, weight, of_beam, lines=spec.capacity)
+    normal, chi_square, spread = lines.principal(sums.scatter)
+    sign = jnp.where(dot(normal, sums.mean) > 0.0, -1.0, 1.0)  # towards the robot
+    degrees = jnp.maximum(count - 2 * trim - 2, 0).astype(xy.dtype)
+    scale = (4.0 + chi_square) / (4.0 + degrees)
+    return _Line(
+        nx=sign * normal[:, 0],
+        ny=sign * normal[:, 1],
+        cx=sums.mean[:, 0],
+        cy=sums.mean[:, 1],
+        offset_variance=scale / jnp.maximum(sums.weight, 1e-9),
+        angle_variance=scale / jnp.maximum(spread, 1e-6),
+        centre=sums.mean,
+    )
+
+
+def _project_ends(end_beams: _EndBeams, line: _Line, fitted: Array) -> tuple[Array, Array]:
+    """Outermost hits x, y (K, 2) [m], projected onto the line where there is one: c + s u."""
+    x, y = end_beams.x, end_beams.y
+    along = line.coordinate(x, y)
+    x = jnp.where(fitted[:, None], line.cx[:, None] + along * line.ny[:, None], x)
+    y = jnp.where(fitted[:, None], line.cy[:, None] - along * line.nx[:, None], y)
+    return x, y
+
+
+def _adjacent(spans: lines.Spans, end_beams: _EndBeams) -> Array:
+    """Whether the next piece (K,) begins at the next beam, without a jump between them."""
+    slot = jnp.arange(spans.first.size, dtype=jnp.int32)
+    next_beam = spans.last + 1 == jnp.roll(spans.first, -1)
+    return (slot < slot.size - 1) & next_beam & (end_beams.jump[:, 1] == 0.0)
+
+
+def _corners(
+    line: _Line,
+    x: Array,
+    y: Array,
+    adjacent: Array,
+    fitted: Array,
+    noise: float,
+    lidar: Lidar,
+    spec: RunSpec,
+) -> tuple[_Ends, Array]:
+    """Intersection of the line of each piece with that of the next one.
+
+    With n, c of a line, m, d of the next and turn = n x m (the sine of the angle between them):
+
+        corner p:        n (p - c) = 0,  m (p - d) = 0
+                         p = c - s u,    s = m (d - c) / turn
+        its covariance:  A^-1 diag(v, w) A^-T,  A = [n; m],  det A = turn
+                         A^-1 = [[my, -ny], [-mx, nx]] / turn
+
+    where v and w are the variances of the two lines across themselves, at p.
+
+    Args:
+        line: Lines of the pieces.
+        x: (K, 2) [m] ends on the lines.
+        y: (K, 2) [m] ends on the lines.
+        adjacent: (K,) bool.
+        fitted: (K,) bool.
+        noise: [m] standard deviation of a range.
+        lidar: The scanner.
+        spec: Parameters.
+
+    Returns:
+        The corners (K,), and whether the two pieces meet there: they are adjacent, their lines are
+        not nearly parallel, and the corner is near the end of one and the beginning of the other.
+    """
+    nx, ny, cx, cy = line.nx, line.ny, line.cx, line.cy
+    own = [nx, ny, cx, cy, line.offset_variance, line.angle_variance, x[:, 0], y[:, 0]]
+    following = jnp.roll(jnp.stack(own), -1, axis=1)
+    mx, my, dx, dy, next_offset_variance, next_angle_variance, next_x, next_y = following
+    turn = nx * my - ny * mx
+    safe = jnp.where(jnp.abs(turn) > 0.1, turn, 1.0)
+    along = ((dx - cx) * mx + (dy - cy) * my) / safe
+    corner_x, corner_y = cx - ny * along, cy + nx * along
+
+    tolerance = spec.corner + 3 * noise / jnp.maximum(jnp.abs(turn), 0.3)
+    tolerance += 2 * lidar.step * _length(corner_x, corner_y)
+    near = _length(corner_x - x[:, 1], corner_y - y[:, 1]) < tolerance
+    near &= _length(corner_x - next_x, corner_y - next_y) < tolerance
+    meets = adjacent & fitted & jnp.roll(fitted, -1) & (jnp.abs(turn) > 0.3) & near
+
+    next_along = (corner_x - dx) * my - (corner_y - dy) * mx
+    variance = (along**2 * line.angle_variance + line.offset_variance) / safe**2
+    next_variance = (next_along**2 * next_angle_variance + next_offset_variance) / safe**2
+    corner = _Ends(
+        x=corner_x,
+        y=corner_y,
+        cov_xx=variance * my * my + next_variance * ny * ny,
+        cov_xy=-variance * my * mx - next_variance * ny * nx,
+        cov_yy=variance * mx * mx + next_variance * nx * nx,
+    )
+    return corner, meets
+
+
+def _free_ends(
+    line: _Line, x: Array, y: Array, end_beams: _EndBeams, fitted: Array, lidar: Lidar
+) -> tuple[_Ends, Array]:
+    """Ends (K, 2) of pieces that are no corners, and which of them are occluding ends.
+
+    An occluding end is on the near side of a jump: the beam beyond passes the wall. So the wall
+    ends between the two beams, on average half their spacing on the wall beyond the last hit:
+
+        half = step / 2 * range / cos(incidence)
+
+    The covariance is n n' across + u u' (across + half^2 / 3), where `across` is the variance of
+    the line at the end: along it, the end is uniform within +-half.
+
+    Args:
+        line: Lines of the pieces.
+        x: (K, 2) [m] ends on the lines.
+        y: (K, 2) [m] ends on the lines.
+        end_beams: The outermost beams.
+        fitted: (K,) bool; the ends of other pieces stay where they are.
+        lidar: The scanner.
+    """
+    nx, ny = line.nx[:, None], line.ny[:, None]
+    distance = _length(x, y)
+    cos_incidence = jnp.abs(nx * x + ny * y) / jnp.maximum(distance, 1e-6)
+    half = 0.5 * lidar.step * distance / jnp.maximum(cos_incidence, 0.1)
+    occluding = end_beams.jump > 0.0
+    occluding &= end_beams.ranges < jnp.minimum(end_beams.range_beyond, 0.9 * lidar.reach)
+    outwards = jnp.array([-1.0, 1.0], x.dtype)[None]
+    shift = jnp.where(occluding & fitted[:, None], half, 0.0) * outwards
+    x, y = x + ny * shift, y - nx * shift
+
+    offset_variance, angle_variance = line.offset_variance[:, None], line.angle_variance[:, None]
+    across = offset_variance + line.coordinate(x, y) ** 2 * angle_variance
+    along = across + half**2 / 3
+    ends = _Ends(
+        x=x,
+        y=y,
+        cov_xx=across * nx * nx + along * ny * ny,
+        cov_xy=(across - along) * nx * ny,
+        cov_yy=across * ny * ny + along * nx * nx,
+    )
+    return ends, occluding
+
+
+def run_cells(scan: Scan, lidar: Lidar, runs: Runs, spec: GridSpec, *, fill: int = 6) -> Array:
+    """Segment (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
+
+    Args:
+        scan: The scan.
+        lidar: Its scanner.
+        runs: Its segments; where two share a cell, the later one has it.
+        spec: The grid to draw on.
+        fill: Points drawn from each hit to the next of the same segment.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    xy, of_beam = points(scan, lidar), runs.of_beam
     capacity = runs.valid.size
-    last = jnp.arange(of.size, dtype=jnp.int32) == of.size - 1
-    same = (of == jnp.roll(of, -1)) & runs.valid[jnp.minimum(of, capacity - 1)] & ~last
-    part = jnp.where(same[:, None], jnp.arange(fill, dtype=xy.dtype) / fill, 0.0)
-    drawn = xy[:, None] + part[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
-    drawn = jnp.where((of < capacity)[:, None, None], drawn, jnp.inf)
+    is_last = jnp.arange(of_beam.size, dtype=jnp.int32) == of_beam.size - 1
+    continues = (of_beam == jnp.roll(of_beam, -1)) & ~is_last
+    continues &= runs.valid[jnp.minimum(of_beam, capacity - 1)]
+    fraction = jnp.where(continues[:, None], jnp.arange(fill, dtype=xy.dtype) / fill, 0.0)
+    drawn = xy[:, None] + fraction[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
+    drawn = jnp.where((of_beam < capacity)[:, None, None], drawn, jnp.inf)
     index = cell_of(drawn.reshape(-1, 2), spec)
-    run = jnp.full(spec.shape, -1, jnp.int8)
-    return run.at[index[:, 0], index[:, 1]].max(jnp.repeat(of, fill).astype(jnp.int8), mode="drop")
+    cells = jnp.full(spec.shape, -1, jnp.int8)
+    values = jnp.repeat(of_beam, fill).astype(jnp.int8)
+    return cells.at[index[:, 0], index[:, 1]].max(values, mode="drop")

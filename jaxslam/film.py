@@ -1,4 +1,4 @@
-"""A film of a run: what the filter believed, scan by scan."""
+"""Animation of a run: scans, estimated trajectory and landmarks of the filter, as GIF."""
 
 from pathlib import Path
 
@@ -27,51 +27,60 @@ def film(
     *,
     frames: int = FRAMES,
 ) -> None:
-    """Filter a log again, and film it as GIF.
+    """Run the filter on a log again, and write an animation of it as GIF.
 
     Args:
         path: File to write.
-        config: Of the filter.
-        noise: What it assumes.
-        inputs: [T] of the filter.
-        scans: [T].
-        way: (T, 3) estimated poses, of the whole run.
-        odometry: (T, 3) the way by odometry alone, world frame.
-        frames: At most.
+        config: Configuration of the filter.
+        noise: Noise parameters of the filter.
+        inputs: [T] inputs of the filter.
+        scans: [T] laser scans.
+        way: (T, 3) [m, m, rad] estimated trajectory of the whole run; it sets the limits of the
+            axes.
+        odometry: (T, 3) [m, m, rad] trajectory by odometry alone, world frame.
+        frames: Largest number of frames.
     """
-    from jaxslam import plot  # matplotlib takes its time to load
+    from jaxslam import plot  # imported here, because matplotlib is slow to import
 
-    count = len(odometry)
-    each = -(-count // frames)  # scans of a frame
-    frames = -(-count // each)
-    # Blind steps without motion fill the last frame: one program serves all.
-    fill = lambda x: jnp.pad(x, [(0, frames * each - count)] + [(0, 0)] * (x.ndim - 1))
-    inputs = jax.tree.map(fill, inputs)
-    beams = np.asarray(jax.vmap(lidar.points, in_axes=(0, None))(scans, config.lidar))
+    num_scans = len(odometry)
+    scans_per_frame = -(-num_scans // frames)
+    frames = -(-num_scans // scans_per_frame)
+
+    def pad(values: jax.Array) -> jax.Array:
+        """Fill the last frame by steps without features and motion: one program serves all."""
+        num_padding = frames * scans_per_frame - num_scans
+        return jnp.pad(values, [(0, num_padding)] + [(0, 0)] * (values.ndim - 1))
+
+    inputs = jax.tree.map(pad, inputs)
+    points = np.asarray(jax.vmap(lidar.points, in_axes=(0, None))(scans, config.lidar))
     hit = np.asarray(scans.hit)
-    belief, poses = slam.init(config, jnp.asarray(odometry[0], float)), np.zeros((0, 3))
-    far = [beams[k][hit[k]] for k in range(count)]
-    shown = [placed(pose, ends) for pose, ends in zip(way, far, strict=True) if len(ends)]
-    figure, axis = plot.plan(*plot.extent(way, *shown))
-    look = {"xlim": axis.get_xlim(), "ylim": axis.get_ylim(), "aspect": "equal"}
-    look |= {"xlabel": "x [m]", "ylabel": "y [m]"}
+    returns = [points[scan][hit[scan]] for scan in range(num_scans)]
+    belief = slam.init(config, jnp.asarray(odometry[0], float))
+    poses = np.zeros((0, 3))
+    world_points = [
+        placed(pose, ends) for pose, ends in zip(way, returns, strict=True) if len(ends)
+    ]
+    figure, axis = plot.plan(*plot.extent(way, *world_points))
+    axis_style = {"xlim": axis.get_xlim(), "ylim": axis.get_ylim(), "aspect": "equal"}
+    axis_style |= {"xlabel": "x [m]", "ylabel": "y [m]"}
 
-    def draw(k: int) -> None:
+    def draw(frame: int) -> None:
         nonlocal belief, poses
-        some = jax.tree.map(lambda x: x[k * each : (k + 1) * each], inputs)
-        belief, info = slam.run(config, noise, belief, some)
-        poses = np.concatenate([poses, np.asarray(info.pose, np.float64)])[:count]
-        now = len(poses)
+        first = frame * scans_per_frame
+        chunk = jax.tree.map(lambda values: values[first : first + scans_per_frame], inputs)
+        belief, info = slam.run(config, noise, belief, chunk)
+        poses = np.concatenate([poses, np.asarray(info.pose, np.float64)])[:num_scans]
+        done = len(poses)
         axis.clear()
-        plot.echoes(axis, poses, beams[:now], hit[:now])
-        plot.trajectory(axis, odometry[:now], "odometry")
+        plot.echoes(axis, poses, points[:done], hit[:done])
+        plot.trajectory(axis, odometry[:done], "odometry")
         plot.trajectory(axis, poses, "estimate")
         plot.landmarks(axis, belief, confirm=config.confirm)
-        plot.robot(axis, poses[-1], far[now - 1])
-        axis.set(**look, title=f"scan {now} of {count}")
+        plot.robot(axis, poses[-1], returns[done - 1])
+        axis.set(**axis_style, title=f"scan {done} of {num_scans}")
         if not figure.legends:
             plot.legend(figure)
         bar.update()
 
-    with tqdm(total=frames, unit="frame", desc="film") as bar:
+    with tqdm(total=frames, unit="frame", desc="animation") as bar:
         plot.film(path, figure, draw, frames)

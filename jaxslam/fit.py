@@ -1,10 +1,10 @@
-"""Noise that is tuned, not guessed: gradient descent on what the filter gets wrong.
+"""Tune Q and R by gradient descent on a loss of the filter.
 
-Front end and data come first, the noise after: features are computed once, and only the filter is
-run again and differentiated. All of `Noise` is smooth and tuned, as logarithms. Matches are not:
-they are integers, found anew at every evaluation, and the gradient is that of the filter with its
-matches held fixed. So what decides on matches alone, above all the probability of the association
-gate (`MatchSpec.gate`), has no gradient, and is not tuned here.
+Features are extracted once; each evaluation runs the filter on them and differentiates it. All
+fields of `Noise` are smooth and tuned, as logarithms. Data association is not smooth: it is found
+anew at every evaluation, and the gradient is that of the filter with its matches held fixed.
+Parameters that act on the matches alone, above all the probability of the association gate
+(`MatchSpec.gate`), have no gradient, and are not tuned here.
 """
 
 from collections.abc import Callable, Collection
@@ -29,26 +29,45 @@ GROUP = 4  # runs that a device differentiates together; bounds memory
 
 
 class State(NamedTuple):
-    """Where a tuning stands: all that it needs to go on. P parameters, N steps in all."""
+    """State of a tuning, with all that it needs to continue. P parameters, N updates in all.
 
-    step: np.ndarray  # () int64, evaluated so far
-    theta: np.ndarray  # (P,) float64, logarithms of the noise to be evaluated next
-    optimiser: Any  # state of the optimiser, of the parameters that are free
-    thetas: np.ndarray  # (N + 1, P) float64, what each step evaluated
-    loss: np.ndarray  # (N + 1,) float64, mean over the runs of each step; NaN: not yet
-    heldout: np.ndarray  # (N + 1,) float64, over the held-out runs; NaN: not evaluated
-    skipped: np.ndarray  # (N + 1,) int64, runs left out because they gave no finite gradient
+    Attributes:
+        step: () int64 number of evaluations so far.
+        theta: (P,) float64 logarithms of the noise to be evaluated next.
+        optimiser: State of the optimiser, of the free parameters.
+        thetas: (N + 1, P) float64 logarithms that each evaluation used; NaN: not yet.
+        loss: (N + 1,) float64 mean over the runs of each evaluation; NaN: not yet.
+        heldout: (N + 1,) float64 mean over the held-out runs; NaN: not evaluated.
+        skipped: (N + 1,) int64 runs left out of the mean because a value was not finite.
+    """
+
+    step: np.ndarray
+    theta: np.ndarray
+    optimiser: Any
+    thetas: np.ndarray
+    loss: np.ndarray
+    heldout: np.ndarray
+    skipped: np.ndarray
 
 
 class Fit(NamedTuple):
-    """Result of `tune`. N evaluations: steps + 1, or fewer when it stopped early."""
+    """Result of `tune`. N evaluations: one more than updates, or fewer when it stopped early.
 
-    noise: Noise  # the best
-    best: int  # and which evaluation that is
-    loss: np.ndarray  # (N,) mean over the runs of each step
-    heldout: np.ndarray  # (N,) mean over the held-out runs; NaN where not evaluated
-    history: Noise  # [N] what each step evaluated
-    skipped: np.ndarray  # (N,) runs left out because they gave no finite gradient
+    Attributes:
+        noise: The best noise.
+        best: Number of the evaluation it is from.
+        loss: (N,) mean over the runs of each evaluation.
+        heldout: (N,) mean over the held-out runs; NaN where not evaluated.
+        history: [N] noise that each evaluation used.
+        skipped: (N,) runs left out of the mean because a value was not finite.
+    """
+
+    noise: Noise
+    best: int
+    loss: np.ndarray
+    heldout: np.ndarray
+    history: Noise
+    skipped: np.ndarray
 
 
 def unconstrain(noise: Noise) -> Noise:
@@ -57,7 +76,7 @@ def unconstrain(noise: Noise) -> Noise:
 
 
 def constrain(theta: Noise) -> Noise:
-    """Noise of its logarithms; the inverse of `unconstrain`."""
+    """Noise from its logarithms; the inverse of `unconstrain`."""
     return jax.tree.map(jnp.exp, theta)
 
 
@@ -67,7 +86,7 @@ def theta_of(noise: Noise) -> np.ndarray:
 
 
 def noise_of(theta: Any, like: Noise) -> Noise:
-    """Noise of logarithms (P,), with the fields and precision of another."""
+    """Noise from logarithms (P,), with the fields and precision of another."""
     flat, unravel = ravel_pytree(like)
     return constrain(unravel(jnp.asarray(theta, flat.dtype)))
 
@@ -83,14 +102,14 @@ def names(noise: Noise) -> tuple[str, ...]:
 
 
 def free(noise: Noise, frozen: Collection[str] = ()) -> np.ndarray:
-    """Which of the P parameters (P,) bool are tuned.
+    """Mask (P,) bool of the parameters that are tuned.
 
     Args:
         noise: The noise.
-        frozen: Names of parameters that stay, or of fields: `odometry` is all four.
+        frozen: Names of parameters that are not tuned, or of fields: `odometry` is all four.
 
     Raises:
-        ValueError: There is no such parameter, or none is left.
+        ValueError: There is no such parameter, or none is left to tune.
     """
     known = names(noise)
     unknown = set(frozen) - set(known) - set(noise._fields)
@@ -98,14 +117,14 @@ def free(noise: Noise, frozen: Collection[str] = ()) -> np.ndarray:
         raise ValueError(
             f"no parameter is called {sorted(unknown)[0]!r}; known: {', '.join(known)}"
         )
-    rest = np.array([not {name, name.split("[")[0]} & set(frozen) for name in known])
-    if not rest.any():
+    trainable = np.array([not {name, name.split("[")[0]} & set(frozen) for name in known])
+    if not trainable.any():
         raise ValueError("all parameters are frozen: nothing is left to tune")
-    return rest
+    return trainable
 
 
 def scaled(noise: Noise, parameter: int, by: float) -> Noise:
-    """The noise with one of its P parameters times exp(by)."""
+    """The noise with one of its P parameters multiplied by exp(by)."""
     flat, unravel = ravel_pytree(noise)
     return unravel(flat.at[parameter].multiply(jnp.exp(jnp.asarray(by, flat.dtype))))
 
@@ -141,10 +160,11 @@ def gradients(
 
 
 def mean_gradient(values: np.ndarray, each: np.ndarray) -> tuple[float, np.ndarray, int]:
-    """Means of losses (B,) and gradients (B, P) over runs, those left out where one is not finite.
+    """Means of losses (B,) and gradients (B, P) over the runs where both are finite.
 
     Returns:
-        Mean loss, NaN of no runs; mean gradient (P,), 0 of no runs; number of runs left out.
+        Mean loss, NaN if no run is left; mean gradient (P,), 0 if no run is left; number of runs
+        left out.
     """
     good = np.isfinite(values) & np.isfinite(each).all(axis=1)
     if not good.any():
@@ -153,13 +173,15 @@ def mean_gradient(values: np.ndarray, each: np.ndarray) -> tuple[float, np.ndarr
 
 
 def draw(seed: int, step: int, runs: int, batch: int) -> np.ndarray:
-    """Runs (batch,) of a step: the next of a shuffled pack of all, and shuffled anew after it."""
-    place = step * batch + np.arange(batch)
-    pack = {
-        turn: np.random.default_rng([seed, turn]).permutation(runs)
-        for turn in set((place // runs).tolist())
-    }
-    return np.sort([pack[turn][at] for turn, at in zip(place // runs, place % runs, strict=True)])
+    """Minibatch of a step: sorted numbers (batch,) of runs, drawn without replacement.
+
+    Steps take the next `batch` numbers of a sequence of permutations of all runs, one for each
+    epoch, which depend on the seed alone: a step can be drawn without the steps before it.
+    """
+    position = step * batch + np.arange(batch)
+    epoch, offset = position // runs, position % runs
+    order = {e: np.random.default_rng([seed, e]).permutation(runs) for e in set(epoch.tolist())}
+    return np.sort([order[e][k] for e, k in zip(epoch, offset, strict=True)])
 
 
 def tune(
@@ -179,41 +201,52 @@ def tune(
     state: State | None = None,
     report: Callable[[State], Any] | None = None,
 ) -> Fit:
-    """Fit the noise to runs by gradient descent.
+    """Tune the noise on runs by gradient descent.
+
+        for step in 0 .. steps:
+            loss, gradient = mean over the runs of this step (all, or a minibatch)
+            if it is due: heldout = mean loss over the held-out runs
+            record them
+            theta <- theta + update of the optimiser, free parameters only
+            call `report` with the state
+            stop if the last `patience` values of heldout are no better than one before
+
+    The update after the last evaluation is part of the state but not of the result.
 
     Args:
         noise: Where to start.
         config: Of the filter.
         logs: [B] training runs.
-        loss: Mean of this over runs is made small; one of `losses`, or any function of the info
-            of a filtered run and its log.
-        optimiser: Of the logarithms of the free parameters; `descent.usual` unless given.
+        loss: Its mean over runs is minimised; one of `losses`, or any function of the step infos
+            of the filter on a run, and its log.
+        optimiser: Of the logarithms of the free parameters; `descent.usual` by default.
         steps: Number of updates.
-        batch: Runs a step, in turn from a shuffled pack; all of them unless given.
-        seed: Of that shuffle.
-        frozen: Names of parameters, or fields of the noise, that stay as they are.
-        heldout: [H] runs to judge by, which nothing is tuned on.
-        every: Evaluations from one judgement to the next.
-        patience: Judgements without a better one after which it stops; never unless given.
-        state: Where an earlier call with the same arguments stood; the result is the same.
-        report: Called with the state after each evaluation: to show it, or to keep it.
+        batch: Runs of a minibatch; all of them by default.
+        seed: Of the order of minibatches.
+        frozen: Names of parameters, or fields of the noise, that are not tuned.
+        heldout: [H] runs for validation, which nothing is tuned on.
+        every: Evaluations from one validation to the next.
+        patience: Validations without improvement after which it stops; by default it does not.
+        state: State of an earlier call with the same arguments, to continue from; the result is
+            the same as without the interruption.
+        report: Callback with the state after each evaluation.
 
     Returns:
-        The fit. Its noise is the best: on the held-out runs where there are any, else on all
-        training runs; or the last, where each step sees other runs and nothing compares them.
+        The fit. Its noise is the best: on the held-out runs if there are any, else on all training
+        runs; with minibatches and no held-out runs, whose losses are not comparable, the last.
 
     Raises:
-        ValueError: Runs are too few or lack the truth that the loss needs, a name is none of a
-            parameter, a number is out of range, or the noise is not positive.
+        ValueError: There are no runs, or the loss needs ground truth and a run has none; a
+            parameter's name is unknown, a number is out of range, or the noise is not positive.
     """
     losses.check(loss, logs)
     if heldout is not None:
         losses.check(loss, heldout, what="heldout")
-    for name, number in {"batch": batch, "every": every, "patience": patience}.items():
+    for name, number in (("batch", batch), ("every", every), ("patience", patience)):
         if number is not None and number < 1:
             raise ValueError(f"{name} is {number}; it must be 1 or more")
     noise = jax.tree.map(lambda x: jnp.asarray(x, float), noise)
-    moves, runs = free(noise, frozen), logs.motion.shape[0]
+    trainable, runs = free(noise, frozen), logs.motion.shape[0]
     whole = batch is None or batch >= runs
     optimiser = usual(steps, whole=whole) if optimiser is None else optimiser
     optimiser = optax.with_extra_args_support(optimiser)
@@ -221,16 +254,14 @@ def tune(
         state = begin(noise, steps=steps, frozen=frozen, optimiser=optimiser)
 
     while state.step <= steps and not _stalled(state, patience):
-        now, step = noise_of(state.theta, noise), int(state.step)
-        some = logs
-        if not whole:
-            some = jax.tree.map(partial(_take, draw(seed, step, runs, batch)), logs)
-        value, gradient, bad = mean_gradient(*gradients(now, config, some, loss))
-        judged = np.nan
+        current, step = noise_of(state.theta, noise), int(state.step)
+        training = logs if whole else _take(draw(seed, step, runs, batch), logs)
+        value, gradient, skipped = mean_gradient(*gradients(current, config, training, loss))
+        validation = np.nan
         if heldout is not None and (step % every == 0 or step == steps):
-            judged = _finite_mean(values(now, config, heldout, loss))
-        state = _note(state, value, judged, bad)
-        state = _move(state, optimiser, value, gradient, moves)
+            validation = _finite_mean(values(current, config, heldout, loss))
+        state = _record(state, value, validation, skipped)
+        state = _update_theta(state, optimiser, value, gradient, trainable)
         if report is not None:
             report(state)
     return result(state, noise, whole=whole)
@@ -246,81 +277,86 @@ def begin(
     """The state before the first evaluation; the arguments are those of `tune`.
 
     Raises:
-        ValueError: The noise is not positive, or a name is none of a parameter.
+        ValueError: The noise is not positive, or a parameter's name is unknown.
     """
     start = np.asarray(ravel_pytree(noise)[0], np.float64)
     if not (np.isfinite(start) & (start > 0.0)).all():
         raise ValueError(f"the noise to start from is not positive: {noise}")
-    theta, none = np.log(start), np.full(steps + 1, np.nan)
+    theta, not_yet = np.log(start), np.full(steps + 1, np.nan)
     return State(
         step=np.int64(0),
         theta=theta,
         optimiser=optimiser.init(jnp.asarray(theta[free(noise, frozen)])),
         thetas=np.full((steps + 1, theta.size), np.nan),
-        loss=none,
-        heldout=none,
+        loss=not_yet,
+        heldout=not_yet,
         skipped=np.zeros(steps + 1, np.int64),
     )
 
 
 def result(state: State, noise: Noise, *, whole: bool = True) -> Fit:
-    """What a state has found so far; `noise` is any with the same parameters.
+    """Result of the evaluations so far.
 
     Args:
         state: After one evaluation at least.
-        noise: Any noise: for its fields.
-        whole: Whether each step saw all runs, so that their losses compare.
+        noise: Any noise with the same parameters, for its fields and precision.
+        whole: Whether each step evaluated all runs, so that their losses are comparable.
     """
-    done = int(state.step)
+    count = int(state.step)
     like, unravel = ravel_pytree(noise)
-    thetas = jnp.asarray(state.thetas[:done], like.dtype)
+    thetas = jnp.asarray(state.thetas[:count], like.dtype)
     best = _best(state, whole)
     return Fit(
         noise=constrain(unravel(thetas[best])),
         best=best,
-        loss=state.loss[:done],
-        heldout=state.heldout[:done],
+        loss=state.loss[:count],
+        heldout=state.heldout[:count],
         history=constrain(jax.vmap(unravel)(thetas)),
-        skipped=state.skipped[:done],
+        skipped=state.skipped[:count],
     )
 
 
-def _note(state: State, value: float, judged: float, bad: int) -> State:
-    """Write an evaluation down."""
-    at = np.arange(len(state.loss)) == state.step
-    put = lambda old, new: np.where(at.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+def _record(state: State, value: float, validation: float, skipped: int) -> State:
+    """Record an evaluation; the arrays of the state before are not changed."""
+
+    def put(old: np.ndarray, new: Any) -> np.ndarray:
+        changed = np.array(old)
+        changed[state.step] = new
+        return changed
+
     return state._replace(
         step=state.step + 1,
-        thetas=put(state.thetas, state.theta[None]),
+        thetas=put(state.thetas, state.theta),
         loss=put(state.loss, value),
-        heldout=put(state.heldout, judged),
-        skipped=put(state.skipped, bad),
+        heldout=put(state.heldout, validation),
+        skipped=put(state.skipped, skipped),
     )
 
 
-def _move(
-    state: State, optimiser: Any, value: float, gradient: np.ndarray, moves: np.ndarray
+def _update_theta(
+    state: State, optimiser: Any, value: float, gradient: np.ndarray, trainable: np.ndarray
 ) -> State:
-    """Update the free parameters."""
-    theta = jnp.asarray(state.theta[moves])
-    slope = jnp.asarray(gradient[moves], theta.dtype)
-    with jax.numpy_dtype_promotion("standard"):  # optax asks for it
+    """Update the trainable parameters (P,) bool by the optimiser."""
+    theta = jnp.asarray(state.theta[trainable])
+    slope = jnp.asarray(gradient[trainable], theta.dtype)
+    with jax.numpy_dtype_promotion("standard"):  # optax needs it
         loss = jnp.asarray(value, theta.dtype)
-        change, kept = _change(optimiser, slope, state.optimiser, theta, loss)
-    moved = state.theta.copy()
-    moved[moves] += np.asarray(change, np.float64)
-    return state._replace(theta=moved, optimiser=kept)
+        change, inner = _optimiser_update(optimiser, slope, state.optimiser, theta, loss)
+    updated = state.theta.copy()
+    updated[trainable] += np.asarray(change, np.float64)
+    return state._replace(theta=updated, optimiser=inner)
 
 
 @partial(jax.jit, static_argnums=0)
-def _change(
-    optimiser: Any, slope: Array, state: Any, theta: Array, value: Array
+def _optimiser_update(
+    optimiser: Any, gradient: Array, state: Any, theta: Array, value: Array
 ) -> tuple[Array, Any]:
-    return optimiser.update(slope, state, theta, value=value)
+    return optimiser.update(gradient, state, theta, value=value)
 
 
-def _take(chosen: np.ndarray, x: Array) -> Array:
-    return x[chosen]
+def _take(indices: np.ndarray, logs: Log) -> Log:
+    """Some of the runs, by number."""
+    return jax.tree.map(lambda x: x[indices], logs)
 
 
 def _finite_mean(values: np.ndarray) -> float:
@@ -329,14 +365,15 @@ def _finite_mean(values: np.ndarray) -> float:
 
 
 def _best(state: State, whole: bool) -> int:
-    """Number of the best evaluation."""
-    for found in (state.heldout, state.loss) if whole else (state.heldout,):
-        if np.isfinite(found).any():
-            return int(np.nanargmin(found))
+    """Number of the best evaluation: by held-out loss, else by comparable losses, else the last."""
+    for series in (state.heldout, state.loss) if whole else (state.heldout,):
+        if np.isfinite(series).any():
+            return int(np.nanargmin(series))
     return int(state.step) - 1
 
 
 def _stalled(state: State, patience: int | None) -> bool:
-    """Whether the last judgements, as many as the patience, all were worse than one before."""
-    judged = state.heldout[np.isfinite(state.heldout)]
-    return patience is not None and len(judged) - 1 - np.argmin([*judged, np.inf]) >= patience
+    """Whether the best validation is `patience` or more validations ago."""
+    validations = state.heldout[np.isfinite(state.heldout)]
+    since_best = len(validations) - 1 - np.argmin([*validations, np.inf])
+    return patience is not None and since_best >= patience

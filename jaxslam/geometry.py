@@ -1,4 +1,4 @@
-"""Angles, SE(2) and polar form."""
+"""Angles, SE(2) poses and polar form, in JAX."""
 
 import jax.numpy as jnp
 
@@ -17,41 +17,42 @@ def wrap_line(angle: Array) -> Array:
 
 def rotation(angle: Array) -> Array:
     """Matrix (2, 2) that turns vectors counter-clockwise by `angle` [rad]."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
 
 
 def compose(pose: Array, motion: Array) -> Array:
-    """Pose (3,) reached from `pose` (3,) by `motion` (3,), which is in the frame of `pose`."""
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    """Pose (3,) after `motion` (3,), given in the frame of `pose` (3,): pose (+) motion."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     return jnp.stack(
         [
-            pose[0] + c * motion[0] - s * motion[1],
-            pose[1] + s * motion[0] + c * motion[1],
+            pose[0] + cos * motion[0] - sin * motion[1],
+            pose[1] + sin * motion[0] + cos * motion[1],
             wrap_angle(pose[2] + motion[2]),
         ]
     )
 
 
 def between(a: Array, b: Array) -> Array:
-    """Motion (3,) that leads from pose `a` (3,) to pose `b` (3,): the inverse of `compose`."""
-    c, s = jnp.cos(a[2]), jnp.sin(a[2])
-    d = b[:2] - a[:2]
-    return jnp.stack([c * d[0] + s * d[1], c * d[1] - s * d[0], wrap_angle(b[2] - a[2])])
+    """Pose `b` (3,) relative to pose `a` (3,), in the frame of `a`: the inverse of `compose`."""
+    cos, sin = jnp.cos(a[2]), jnp.sin(a[2])
+    gap = b[:2] - a[:2]
+    x, y = cos * gap[0] + sin * gap[1], cos * gap[1] - sin * gap[0]
+    return jnp.stack([x, y, wrap_angle(b[2] - a[2])])
 
 
 def to_world(pose: Array, points: Array) -> Array:
-    """Points (..., 2) of the robot frame of `pose` (3,), in the world frame."""
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    """Transform points (..., 2) [m] from the robot frame at `pose` (3,) to the world frame."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y = points[..., 0], points[..., 1]
-    return jnp.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=-1)
+    return jnp.stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y], axis=-1)
 
 
 def to_robot(pose: Array, points: Array) -> Array:
-    """Points (..., 2) of the world, in the robot frame of `pose` (3,)."""
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    """Transform points (..., 2) [m] from the world frame to the robot frame at `pose` (3,)."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y = points[..., 0] - pose[0], points[..., 1] - pose[1]
-    return jnp.stack([c * x + s * y, c * y - s * x], axis=-1)
+    return jnp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def range_bearing(offset: Array) -> Array:

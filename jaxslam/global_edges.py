@@ -1,7 +1,8 @@
-"""Edge codes on a complete global grid, where no sensor tells front from back.
+"""Edge codes on a complete global grid: twelve codes, whichever side a wall is seen from.
 
-A scanner sees only the faces that look towards it, so six codes do (`edges.codes`). On a global
-grid every direction occurs, and the method that the paper compares itself with has twelve.
+A scanner sees only the faces that look towards it, so six codes are enough for a scan
+(`edges.codes`). On a global grid every direction occurs, and the method that the paper compares
+itself with has twelve codes.
 """
 
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ _CODES = (0, 11, 12, 7, 11, 9, 8, 4, 12, 6, 10, 3, 5, 2, 1, 0)
 def global_codes(occupied: Array) -> Array:
     """Edge code (H, W) uint8 of each cell of a complete grid (H, W) bool: 1..12, 0 for no source.
 
-    The paper names the number of codes, not their patterns. Of the sixteen patterns of four
+    The paper gives the number of codes, not their patterns. Of the sixteen patterns of four
     neighbours two are no edge; here the two ends of a line along one axis share a code, which
     makes twelve of the other fourteen. Turning the grid by 90 degrees permutes the codes.
 

@@ -1,8 +1,8 @@
 """Junctions of the Voronoi diagram of one scan as landmarks.
 
-A junction is the centre of a circle that touches three or more walls. The automaton finds the
-cells; the circle is then fitted to the line fits of the runs, which gives it sub-cell accuracy,
-and a covariance from theirs.
+A junction is the centre of an empty circle that touches three or more walls. The automaton finds
+the cells; the circle is then fitted to the line fits of the straight segments, which gives it
+sub-cell accuracy, and a covariance from theirs.
 """
 
 import math
@@ -12,7 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.circles import feet, fit, nearest_three, touch, walls_of
+from jaxslam.circles import (
+    Circles,
+    Touching,
+    Walls,
+    feet,
+    fit,
+    nearest_three,
+    touch,
+    walls_of,
+)
 from jaxslam.edges import Runs
 from jaxslam.geometry import unit
 from jaxslam.grid import GridSpec, centre_of, corner
@@ -20,55 +29,146 @@ from jaxslam.lidar import Lidar, Scan, before_ends, points
 from jaxslam.nodes import Nodes, NodeSpec, blank
 from jaxslam.types import NODE, Array
 
-BLOCK = 3  # [cells] a square of so many leads to one circle
+BLOCK = 3
+"""Side [cells] of the square blocks of the grid, each of which starts one circle at most."""
 
 
 def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
-    """Index (count, 2) of the marked cells of (H, W) bool that are nearest to the robot.
+    """The marked cells nearest to the robot, one of each block of `BLOCK` x `BLOCK` at most.
 
-    One in every block of cells at most. Also whether there is one.
+    Cells are ranked by nearness once, in NumPy; the largest rank of each block is left to sort.
+
+    Args:
+        cells: (H, W) bool, the marked cells.
+        spec: Their grid.
+        count: Number of cells wanted.
+
+    Returns:
+        Index (count, 2) of the cells, nearest first, and whether there is one: (count,) bool.
     """
-    h, w = spec.shape
-    away = np.hypot(*((np.indices((h, w)) + 0.5) * spec.cell + corner(spec)[:, None, None]))
-    nearest_last = np.argsort(-away, axis=None, kind="stable").astype(np.int32)
-    rank = np.empty(h * w, np.float32)
-    rank[nearest_last] = np.arange(1, h * w + 1)
-    key = jnp.where(cells, jnp.asarray(rank.reshape(h, w)), jnp.float32(0.0))
-    key = jnp.pad(key, ((0, -h % BLOCK), (0, -w % BLOCK)))
+    height, width = spec.shape
+    distance = np.hypot(
+        *((np.indices((height, width)) + 0.5) * spec.cell + corner(spec)[:, None, None])
+    )
+    nearest_last = np.argsort(-distance, axis=None, kind="stable").astype(np.int32)
+    rank = np.empty(height * width, np.float32)
+    rank[nearest_last] = np.arange(1, height * width + 1)
+    key = jnp.where(cells, jnp.asarray(rank.reshape(height, width)), jnp.float32(0.0))
+    key = jnp.pad(key, ((0, -height % BLOCK), (0, -width % BLOCK)))
     key = jnp.max(key.reshape(key.shape[0] // BLOCK, BLOCK, -1), axis=1)
     key = jnp.max(key.reshape(len(key), -1, BLOCK), axis=2)
     top, _ = lax.top_k(key.reshape(-1), count)
     flat = jnp.asarray(nearest_last)[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
-    return jnp.stack([flat // w, flat % w], axis=-1), top > 0.0
+    return jnp.stack([flat // width, flat % width], axis=-1), top > 0.0
 
 
-def _part_seen(centre: Array, radius: Array, scan: Scan, lidar: Lidar) -> tuple[Array, Array]:
-    """Part (C,) of the area of circles that was seen, and whether the whole rim was.
+def _seen_fraction(centre: Array, radius: Array, scan: Scan, lidar: Lidar) -> tuple[Array, Array]:
+    """Fraction (C,) of the area of circles that was seen, and whether (C,) the whole disc was.
 
-    What a scan sees is star-shaped around the robot, so it contains a disc if it contains the
-    rim; five per cent of slack for where it touches the walls.
+    The visible region is star-shaped around the robot, so it contains a disc if it contains the
+    rim. The rim is sampled at 95 % of the radius: the circle itself touches the walls.
     """
     turn = jnp.linspace(-jnp.pi, jnp.pi, 24, endpoint=False, dtype=scan.ranges.dtype)
-    rings = jnp.array([0.3, 0.6, 0.8, 0.95], turn.dtype)  # their weight is their radius
+    rings = jnp.array([0.3, 0.6, 0.8, 0.95], turn.dtype)  # fractions of the radius, and weights
     offset = rings[:, None, None] * unit(turn)[None]
-    places = centre[:, None, None] + radius[:, None, None, None] * offset[None]
-    seen = before_ends(places, scan.ranges, lidar)  # (C, 4, 24)
+    samples = centre[:, None, None] + radius[:, None, None, None] * offset[None]
+    seen = before_ends(samples, scan.ranges, lidar)  # (C, 4, 24)
     area = jnp.sum(seen.mean(axis=2, dtype=rings.dtype) * rings[None], axis=1) / jnp.sum(rings)
     return area, jnp.all(seen[:, -1], axis=1)
 
 
-def _first(worth: Array, xy: Array, apart: float, count: int) -> tuple[Array, Array]:
-    """Index (count,) of the places (N, 2) of greatest worth (N,), `apart` [m] from each other.
+def _best_apart(score: Array, xy: Array, apart: float, count: int) -> tuple[Array, Array]:
+    """The best of N points that are at least `apart` from each other: non-maximum suppression.
 
-    Also whether there is one; nothing is worth 0.
+    A point is suppressed by a better one nearer than `apart`.
+
+    Args:
+        score: (N,) larger is better; 0 or less excludes a point.
+        xy: (N, 2) [m].
+        apart: [m].
+        count: Number of points wanted.
+
+    Returns:
+        Index (count,) of the points, best first, and whether there is one: (count,) bool.
     """
-    order = jnp.argsort(-worth, stable=True)
-    xy, good = xy[order], worth[order] > 0.0
+    order = jnp.argsort(-score, stable=True)
+    xy, good = xy[order], score[order] > 0.0
     gap = jnp.linalg.norm(xy[:, None] - xy[None], axis=2)
-    earlier = jnp.tril(jnp.ones(gap.shape, bool), -1)
-    good &= ~jnp.any(earlier & good[None, :] & (gap < apart), axis=1)
-    first = jnp.argsort(~good, stable=True)[:count]
-    return order[first], good[first]
+    better = jnp.tril(jnp.ones(gap.shape, bool), -1)
+    good &= ~jnp.any(better & good[None, :] & (gap < apart), axis=1)
+    best = jnp.argsort(~good, stable=True)[:count]
+    return order[best], good[best]
+
+
+def _neighbours(circle: Touching) -> tuple[Array, Array, Array]:
+    """Where to search for the junctions next to N circles, three for each.
+
+    The fourth wall of a circle (a, b, c) replaces each of its three walls in turn:
+
+        (a, b, c), d  ->  (d, b, c), (a, d, c), (a, b, d)
+
+    Returns:
+        Initial centres x and y (3 N,) [m], and walls (3, 3 N) int32.
+    """
+    is_replaced = jnp.tile(jnp.eye(3, dtype=bool), len(circle.x))  # (3, 3 N)
+    fourth = jnp.repeat(circle.fourth, 3)[None]
+    three = jnp.where(is_replaced, fourth, jnp.repeat(circle.three, 3, axis=1))
+    return jnp.repeat(circle.x, 3), jnp.repeat(circle.y, 3), three
+
+
+def _tangent_circles(
+    cells: Array, walls: Walls, grid: GridSpec, spec: NodeSpec, dtype: jnp.dtype
+) -> tuple[Touching, Array]:
+    """Empty circles through three walls each, found from the junction cells in two rounds.
+
+        round 1:  centre = a junction cell;  walls = the three nearest in different directions
+        round 2:  centre and walls = `_neighbours` of the best circles of round 1
+        each:     solve and exchange walls (`touch`);
+                  drop circles that a wall cuts, whose feet are close together, or that moved > 1 m;
+                  score = smallest angle between two feet;  suppress duplicates
+
+    Both rounds have C = 3 N circles, with N = `spec.nodes`, so they are one scanned program.
+
+    Returns:
+        The best 2 N circles of both rounds, best first, and whether there is one: (2 N,) bool.
+    """
+    index, found = _nearest_cells(cells, grid, spec.candidates)
+    xy = centre_of(index, grid).astype(dtype)
+    x, y = xy[:, 0], xy[:, 1]
+    alike = math.cos(0.7 * spec.apart)
+    three = nearest_three(feet(x, y, walls), alike)
+
+    def search(start: tuple[Array, Array, Array, Array], _: None):
+        x, y, three, found = start
+        circle = touch(x, y, three, walls, swaps=3)
+        moved = jnp.hypot(circle.x - x, circle.y - y)
+        good = found & (circle.depth < 0.05) & (circle.spread > 0.7 * spec.apart) & (moved < 1.0)
+        score = jnp.where(good, circle.spread, 0.0)
+        xy = jnp.stack([circle.x, circle.y], axis=1)
+        best, found = _best_apart(score, xy, spec.distinct, spec.nodes)
+        x, y, three = _neighbours(jax.tree.map(lambda a: a[..., best], circle))
+        return (x, y, three, jnp.repeat(found, 3)), (circle, score)
+
+    _, (rounds, score) = lax.scan(search, (x, y, three, found), length=2)
+    circle = jax.tree.map(lambda a: jnp.concatenate([a[0], a[1]], axis=-1), rounds)
+    xy = jnp.stack([circle.x, circle.y], axis=1)
+    best, found = _best_apart(score.reshape(-1), xy, spec.distinct, 2 * spec.nodes)
+    return jax.tree.map(lambda a: a[..., best], circle), found
+
+
+def _is_junction(circle: Circles, trace: Array, scan: Scan, lidar: Lidar, spec: NodeSpec) -> Array:
+    """Whether fitted circles (C,) are junctions that may be observed.
+
+    The circle is empty of walls and of beam ends, every foot is real, the radius is within limits,
+    the centre is located well (`trace` (C,) [m^2] of its covariance) and in sight.
+    """
+    good = circle.real & (circle.depth < 0.05) & (trace < 0.02)
+    good &= (circle.radius > spec.least) & (circle.radius < spec.most)
+    hits = points(scan, lidar)
+    offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
+    clearance = jnp.min(jnp.where(scan.hit[None], offset, jnp.inf), axis=1)
+    good &= clearance > circle.radius - max(0.05, 4 * lidar.noise)
+    return good & before_ends(circle.centre, scan.ranges, lidar)
 
 
 def find_junctions(
@@ -81,74 +181,48 @@ def find_junctions(
 ) -> Nodes:
     """Junctions of a Voronoi diagram as landmarks, the most trustworthy first.
 
-    A cell of the diagram leads to the circle that touches the walls nearest to it. Where a fourth
-    wall all but touches that circle too, there is another junction close by, which may lie in the
-    same cells: the circles in which it takes the place of one of the three are looked at as well.
+    A junction cell of the diagram leads to the circle that touches the walls nearest to it. Where
+    a fourth wall nearly touches that circle too, another junction is close by, which may lie in
+    the same cells: the circles in which the fourth wall replaces one of the three are searched as
+    well (`_tangent_circles`).
 
-    A junction is kept when its circle is empty, touches at least three walls in directions that
+    A junction is kept if its circle is empty, touches at least three walls in directions that
     differ, and every foot is real: no foot is an end made by occlusion or by the field of view.
 
     Args:
         cells: (H, W) bool, the junction cells.
         scan: The scan.
-        runs: Its straight runs.
+        runs: Its straight segments.
         lidar: The scanner.
         grid: The grid of `cells`.
         spec: Capacities and limits.
+
+    Returns:
+        `spec.nodes` features of kind `NODE`, trusted ones first; robot frame.
     """
-    walls = walls_of(runs)
-    index, found = _nearest_cells(cells, grid, spec.candidates)
-    place = centre_of(index, grid).astype(scan.ranges.dtype)
-    x, y = place[:, 0], place[:, 1]
-    alike = math.cos(0.7 * spec.apart)
-    three = nearest_three(feet(x, y, walls), alike)
-
-    def pursue(start: tuple[Array, Array, Array, Array], _: None):
-        x, y, three, found = start
-        circle = touch(x, y, three, walls, swaps=3)
-        away = jnp.hypot(circle.x - x, circle.y - y)
-        good = found & (circle.depth < 0.05) & (circle.spread > 0.7 * spec.apart) & (away < 1.0)
-        worth = jnp.where(good, circle.spread, 0.0)
-        at = jnp.stack([circle.x, circle.y], axis=1)
-        first, found = _first(worth, at, spec.distinct, spec.nodes)
-        some = jax.tree.map(lambda x: x[..., first], circle)
-        thrice = lambda x: jnp.repeat(x, 3)
-        swapped = jnp.tile(jnp.eye(3, dtype=bool), spec.nodes)  # (3, C)
-        three = jnp.where(swapped, thrice(some.fourth)[None], jnp.repeat(some.three, 3, axis=1))
-        return (thrice(some.x), thrice(some.y), three, thrice(found)), (circle, worth)
-
-    _, (circle, worth) = lax.scan(pursue, (x, y, three, found), length=2)
-    both = jax.tree.map(lambda x: jnp.concatenate([x[0], x[1]], axis=-1), circle)
-    at = jnp.stack([both.x, both.y], axis=1)
-    first, found = _first(worth.reshape(-1), at, spec.distinct, 2 * spec.nodes)
-    both = jax.tree.map(lambda x: x[..., first], both)
-
-    circle = fit(both, runs, within=spec.touch, thick=spec.thick)
-    size = jnp.trace(circle.cov, axis1=1, axis2=2)
-    good = found & circle.real & (circle.depth < 0.05) & (size < 0.02)
-    good &= (circle.radius > spec.least) & (circle.radius < spec.most)
-    hits = points(scan, lidar)
-    offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
-    clearance = jnp.min(jnp.where(scan.hit[None], offset, jnp.inf), axis=1)
-    good &= clearance > circle.radius - max(0.05, 4 * lidar.noise)
-    good &= before_ends(circle.centre, scan.ranges, lidar)
-    area, certified = _part_seen(circle.centre, circle.radius, scan, lidar)
-    trusted = good & (area > spec.seen) & (both.spread > spec.apart) & (size < 0.005)
+    dtype = scan.ranges.dtype
+    tangent, found = _tangent_circles(cells, walls_of(runs), grid, spec, dtype)
+    circle = fit(tangent, runs, within=spec.touch, thick=spec.thick)
+    trace = jnp.trace(circle.cov, axis1=1, axis2=2)
+    good = found & _is_junction(circle, trace, scan, lidar, spec)
+    area, certified = _seen_fraction(circle.centre, circle.radius, scan, lidar)
+    trusted = good & (area > spec.seen) & (tangent.spread > spec.apart) & (trace < 0.005)
     trusted &= (circle.radius > 1.2 * spec.least) & (circle.hidden < spec.hidden)
-    worths = jnp.where(good, jnp.where(trusted, 4.0, 0.0) + both.spread, 0.0)
-    first, good = _first(worths.astype(place.dtype), circle.centre, spec.distinct, spec.nodes)
-    zero = jnp.zeros(spec.nodes, place.dtype)
+    # Angles are below 4: trusted junctions come first.
+    score = jnp.where(good, jnp.where(trusted, 4.0, 0.0) + tangent.spread, 0.0).astype(dtype)
+    best, good = _best_apart(score, circle.centre, spec.distinct, spec.nodes)
+    zero = jnp.zeros(spec.nodes, dtype)
     return blank(
         Nodes(
             kind=jnp.full(spec.nodes, NODE, jnp.int32),
-            xy=circle.centre[first],
-            cov=circle.cov[first],
+            xy=circle.centre[best],
+            cov=circle.cov[best],
             direction=zero,
             variance=zero,
-            shape=circle.radius[first],
-            degree=circle.touched.sum(axis=0, dtype=jnp.int32)[first],
-            certified=certified[first],
-            trusted=trusted[first],
+            shape=circle.radius[best],
+            degree=circle.touched.sum(axis=0, dtype=jnp.int32)[best],
+            certified=certified[best],
+            trusted=trusted[best],
             valid=good,
         )
     )

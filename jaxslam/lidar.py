@@ -1,4 +1,4 @@
-"""The laser scanner: what it is, and what it sees of a world."""
+"""Laser scanner: its parameters, and simulated scans by ray casting."""
 
 import math
 from typing import NamedTuple
@@ -10,28 +10,41 @@ from jaxslam.geometry import cross, unit
 from jaxslam.types import Array, Key, expect
 from jaxslam.world import World
 
-SEAM = 1e-5  # part of a wall's length
+SEAM = 1e-5  # fraction of its length by which a wall is lengthened at either end
 
 
 class Lidar(NamedTuple):
-    """A 2-D laser scanner at the origin of the robot frame; static under jit."""
+    """A 2-D laser scanner at the origin of the robot frame; static under jit.
 
-    beams: int = 361  # R
-    first: float = -math.pi / 2  # [rad] direction of beam 0, robot frame
-    step: float = math.pi / 360  # [rad] from one beam to the next
-    reach: float = 10.0  # [m] beyond this nothing returns
-    noise: float = 0.01  # [m] standard deviation of a range
+    Attributes:
+        beams: Number of beams R.
+        first: [rad] angle of beam 0 in the robot frame; `angle_min` of `sensor_msgs/LaserScan`.
+        step: [rad] from one beam to the next; `angle_increment`.
+        reach: [m] largest range, beyond which nothing returns; `range_max`.
+        noise: [m] standard deviation of a range.
+    """
+
+    beams: int = 361
+    first: float = -math.pi / 2
+    step: float = math.pi / 360
+    reach: float = 10.0
+    noise: float = 0.01
 
 
 class Scan(NamedTuple):
-    """One turn of the scanner."""
+    """One scan.
 
-    ranges: Array  # (R,) [m]; the lidar's reach where nothing was hit
-    hit: Array  # (R,) bool, False where nothing returned
+    Attributes:
+        ranges: (R,) [m]; the largest range of the lidar where nothing was hit.
+        hit: (R,) bool, False where nothing returned.
+    """
+
+    ranges: Array
+    hit: Array
 
 
 def bearings(lidar: Lidar) -> Array:
-    """Directions (R,) [rad] of the beams in the robot frame."""
+    """Angles (R,) [rad] of the beams in the robot frame."""
     return lidar.first + lidar.step * jnp.arange(lidar.beams, dtype=float)
 
 
@@ -46,12 +59,15 @@ def points(scan: Scan, lidar: Lidar) -> Array:
 
 
 def before_ends(places: Array, ranges: Array, lidar: Lidar) -> Array:
-    """Whether places (..., 2) [m, robot frame] lie before the ends of both beams beside them.
+    """Whether points lie before the ends of the two beams on either side: in the visible region.
 
     Args:
-        places: Where to look.
-        ranges: (R,) [m] how far each beam reaches.
-        lidar: The scanner; what lies outside its field of view does not count as before.
+        places: (..., 2) [m] points, robot frame.
+        ranges: (R,) [m] of the beams.
+        lidar: The scanner; points outside its field of view are not visible.
+
+    Returns:
+        (...) bool.
     """
     beam = (jnp.arctan2(places[..., 1], places[..., 0]) - lidar.first) / lidar.step
     low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.beams - 2)
@@ -63,8 +79,8 @@ def cast(world: World, pose: Array, lidar: Lidar) -> Scan:
     """Noise-free scan of `world` from `pose` (3,).
 
     A beam along unit vector u from p meets the wall a + s (b - a), 0 <= s <= 1, at the distance
-    t = (a - p) x (b - a) / (u x (b - a)). Walls are stretched by `SEAM` of their length, so that no
-    beam slips between two that share a corner.
+    t = (a - p) x (b - a) / (u x (b - a)). Walls are lengthened by `SEAM`, so that no beam passes
+    between two that share a corner.
 
     Args:
         world: The walls.
@@ -82,15 +98,15 @@ def cast(world: World, pose: Array, lidar: Lidar) -> Scan:
     slope = cross(beam, along)  # (R, S)
     crosses = jnp.abs(slope) > 1e-9
     safe = jnp.where(crosses, slope, 1.0)
-    distance = cross(start, along) / safe
-    part = cross(start, beam) / safe
-    met = crosses & (distance > 1e-6) & (jnp.abs(part - 0.5) <= 0.5 + SEAM)
+    distance = cross(start, along) / safe  # t
+    fraction = cross(start, beam) / safe  # s
+    met = crosses & (distance > 1e-6) & (jnp.abs(fraction - 0.5) <= 0.5 + SEAM)
     ranges = jnp.min(jnp.where(met, distance, jnp.inf), axis=1)
     return limit(ranges, lidar)
 
 
 def limit(ranges: Array, lidar: Lidar) -> Scan:
-    """Scans of raw ranges (..., R) [m]; NaN, infinite or beyond the reach means nothing returned.
+    """Scans of raw ranges (..., R) [m]; NaN, infinite or beyond the largest range is no return.
 
     Raises:
         ValueError: The ranges are not those of this lidar's beams; while tracing.
@@ -101,6 +117,6 @@ def limit(ranges: Array, lidar: Lidar) -> Scan:
 
 
 def disturb(key: Key, scan: Scan, lidar: Lidar) -> Scan:
-    """Add the lidar's range noise to a scan; readings pushed beyond the reach are lost."""
+    """Add the range noise of the lidar to a scan; ranges beyond the largest become no return."""
     noise = lidar.noise * jax.random.normal(key, scan.ranges.shape, scan.ranges.dtype)
     return limit(jnp.where(scan.hit, scan.ranges + noise, jnp.inf), lidar)

@@ -1,6 +1,7 @@
-"""Recorded drives as logs that the filter is run on: features once, the filter as often as wanted.
+"""Convert recordings of real robots to the data that the filter takes: features, odometry, truth.
 
-Logs of NumPy arrays, one run each or, stacked, of B runs that lead them.
+Features are extracted once, so that the filter can be run many times. Logs hold NumPy arrays: one
+drive each or, stacked, B drives.
 """
 
 import math
@@ -21,34 +22,37 @@ from jaxslam.poses import seen_from
 from jaxslam.slam import Config
 from jaxslam.types import NODE
 
-ROOM = 384, 1024  # landmarks that there is room for in a log of scans: at least, at most
-SPARSE = 2.5  # [m] of the way for which there is room for a landmark, in between
-CONFIRM = 3  # sightings: real buildings have clutter that looks like a landmark once or twice
-PART = 0.01  # what a sighting's own standard deviation is of its range; `Noise.scale` times that
+ROOM = 384, 1024  # capacity for landmarks with a laser scanner: least and most
+SPARSE = 2.5  # [m] driven per landmark, for the capacity in between
+CONFIRM = 3  # observations: clutter in real buildings is taken for a landmark once or twice
+PART = 0.01  # standard deviation of a feature's own covariance per range; `Noise.scale` times it
 
 
-def _look(config: Config, _: tuple, scan: Scan) -> Nodes:
+def _features(config: Config, _: tuple, scan: Scan) -> Nodes:
     return slam.front_end(config, scan)
 
 
-_LOOK = Spread(_look, size=slam.BATCH, static=1)
+_SPREAD_FEATURES = Spread(_features, size=slam.BATCH, static=1)
 
 
 def look(config: Config, scans: Scan) -> Nodes:
-    """Features [T] of scans [T], NumPy arrays, with all devices."""
-    return _LOOK(config, (), scans)
+    """Extract the features [T] of scans [T], on all devices; NumPy arrays."""
+    return _SPREAD_FEATURES(config, (), scans)
 
 
 def config_of_scans(recordings: Sequence[Recording]) -> Config:
-    """What logs of laser scans, all by the same scanner, are filtered with unless told otherwise.
+    """Default configuration for recordings by the same laser scanner.
 
-    There is room for the landmarks of the longest way, in steps of 128.
+    The capacity for landmarks is one per `SPARSE` metres of the longest trajectory, rounded up to
+    a multiple of 128, within `ROOM`.
     """
-    ways = [np.hypot(*np.diff(one.odometry[:, :2], axis=0).T).sum() for one in recordings]
+    lengths = [
+        np.hypot(*np.diff(recording.odometry[:, :2], axis=0).T).sum() for recording in recordings
+    ]
     least, most = ROOM
-    room = 128 * math.ceil(max(ways) / SPARSE / 128)
+    capacity = 128 * math.ceil(max(lengths) / SPARSE / 128)
     lidar = recordings[0].lidar
-    return Config(lidar=lidar, landmarks=min(max(room, least), most), confirm=CONFIRM)
+    return Config(lidar=lidar, landmarks=min(max(capacity, least), most), confirm=CONFIRM)
 
 
 def from_recording(
@@ -58,81 +62,97 @@ def from_recording(
     *,
     aligned: bool = False,
 ) -> Log:
-    """A log of laser scans, from its first scan or the first that has a reference.
+    """Convert laser scans with odometry, from the first scan or the first that has a reference.
 
     Args:
-        recording: T scans with wheel odometry.
+        recording: T scans with odometry.
         config: Of the front end.
-        reference: Times (N,) [s] and poses (N, 3) on the log's clock.
-        aligned: Whether scans are aligned, as `Config.alignment` says, and fused with the wheels.
+        reference: Times (N,) [s] on the recording's clock, and true poses (N, 3).
+        aligned: Whether to add odometry increments by scan matching (`Config.alignment`).
 
     Raises:
         ValueError: No scan is at a time of the reference.
     """
-    wheels = np.asarray(recording.odometry, np.float64)
-    truth, judged, begin = np.zeros_like(wheels), np.zeros(len(wheels), bool), 0
+    odometry = np.asarray(recording.odometry, np.float64)
+    truth, truth_mask, begin = np.zeros_like(odometry), np.zeros(len(odometry), bool), 0
     if reference is not None:
-        i, j = match_times(recording.times, reference[0]).T
+        times, poses = reference
+        i, j = match_times(recording.times, times).T
         if not i.size:
             raise ValueError("the reference has no pose at the time of a scan")
-        truth[i], judged[i], begin = reference[1][j], True, int(i.min())
-    wheels, truth, judged = wheels[begin:], truth[begin:], judged[begin:]
-    motion = motions(wheels)
+        truth[i], truth_mask[i], begin = poses[j], True, int(i.min())
+    increments = motions(odometry[begin:])
     scans = lidar.limit(jnp.asarray(recording.ranges[begin:], float), config.lidar)
-    by_scans = online.align(config, scans, motion) if aligned else None
-    return real(Log(truth, motion, look(config, scans), None, judged, aligned=by_scans))
+    matched = online.align(config, scans, increments) if aligned else None
+    log = Log(
+        truth=truth[begin:],
+        motion=increments,
+        nodes=look(config, scans),
+        judged=truth_mask[begin:],
+        aligned=matched,
+    )
+    return real(log)
 
 
 def motions(poses: np.ndarray) -> np.ndarray:
-    """Motion (T, 3) from each of poses (T, 3) to the next, zero at the first."""
+    """Increments (T, 3) to each of poses (T, 3) from the one before, zero at the first."""
     return np.concatenate([np.zeros((1, 3)), seen_from(poses[:-1], poses[1:])])
 
 
 def from_sightings(sightings: Sightings) -> Log:
-    """A log of landmarks that are told apart; it starts at its first reference, else at zero.
+    """Convert landmark measurements with known identities.
 
-    A sighting's own covariance is that of a range good to `PART` of it, so that `Noise.scale`
-    counts percents of the range, beside `Noise.range` and `Noise.bearing`.
+    The filter starts at the first reference pose, else at zero. A measurement of range r gets the
+    covariance of a point along the beam with the standard deviation `PART` r. So `Noise.scale`
+    counts percents of the range, in addition to `Noise.range` and `Noise.bearing`.
     """
     polar, valid = jnp.asarray(sightings.polar, float), jnp.asarray(sightings.valid)
-    seen = jax.vmap(from_polar, in_axes=(0, 0, None))(polar, valid, PART)
-    known = np.asarray(sightings.which, np.int32)
-    return real(Log(sightings.truth, sightings.motion, seen, known, sightings.referenced))
+    features = jax.vmap(from_polar, in_axes=(0, 0, None))(polar, valid, PART)
+    log = Log(
+        truth=sightings.truth,
+        motion=sightings.motion,
+        nodes=features,
+        known=np.asarray(sightings.which, np.int32),
+        judged=sightings.referenced,
+    )
+    return real(log)
 
 
 def config_of(sightings: Sequence[Sightings]) -> Config:
-    """A filter with room for all landmarks of the sightings, and for all that are seen at once.
+    """Default configuration for landmark measurements: capacity for all of them, in every step.
 
-    Few landmarks that are far off turn the heading far: its linearisation is the invariant one.
+    Updates use the invariant linearisation: with few, distant landmarks corrections of the heading
+    are large.
     """
-    most = max(one.valid.shape[1] for one in sightings)
-    count = max(len(one.names) for one in sightings)
-    sizes = {"landmarks": count, "matches": most, "fresh": most}
-    return Config(kinds=(NODE,), linearisation="invariant", **sizes)
+    most = max(robot.valid.shape[1] for robot in sightings)
+    count = max(len(robot.names) for robot in sightings)
+    return Config(
+        kinds=(NODE,), linearisation="invariant", landmarks=count, matches=most, fresh=most
+    )
 
 
 def stack(logs: Sequence[Log]) -> Log:
-    """Logs of B drives as one; shorter ones stand still, blind, at their end.
+    """Stack the logs of B drives; shorter ones are padded with scans without motion or features.
 
     Raises:
-        ValueError: There are none, or some know their landmarks, or have their scans aligned, and
-            some do not.
+        ValueError: There are none, or some have `known` or `aligned` and others do not.
     """
     if not logs:
         raise ValueError("no logs")
     for name in ("known", "aligned"):
         if len({getattr(log, name) is None for log in logs}) > 1:
             raise ValueError(f"logs with and without `{name}` do not go together")
-    steps = max(len(log.motion) for log in logs)
+    scans = max(len(log.motion) for log in logs)
     features = max(log.nodes.valid.shape[1] for log in logs)
 
-    def fill(x: np.ndarray, features: int | None = None, value: float = 0) -> np.ndarray:
-        ends = [(0, steps - len(x))]
-        ends += [] if features is None else [(0, features - x.shape[1])]
+    def fill(x: np.ndarray, width: int | None = None, value: float = 0) -> np.ndarray:
+        """Pad the scans of an array and, if a width is given, the features of each scan."""
+        ends = [(0, scans - len(x))]
+        ends += [] if width is None else [(0, width - x.shape[1])]
         ends += [(0, 0)] * (x.ndim - len(ends))
         return np.pad(x, ends, constant_values=value)
 
-    long = [
+    padded = [
         Log(
             truth=fill(log.truth),
             motion=fill(log.motion),
@@ -144,11 +164,11 @@ def stack(logs: Sequence[Log]) -> Log:
         )
         for log in logs
     ]
-    return jax.tree.map(lambda *x: np.stack(x), *long)
+    return jax.tree.map(lambda *x: np.stack(x), *padded)
 
 
 def real(log: Log) -> Log:
-    """The log in NumPy arrays, of the precision that JAX works in."""
+    """The log with NumPy arrays, floats in the precision of JAX (float32 unless x64 is on)."""
     precision = jnp.zeros(()).dtype
 
     def convert(x: np.ndarray) -> np.ndarray:

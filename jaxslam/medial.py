@@ -1,9 +1,10 @@
-"""Medial cells of a map: where a robot that fits keeps furthest from all that is not free.
+"""Medial axis of the free space of an occupancy grid, by topology-preserving thinning.
 
-The places of the robot's centre are thinned from the outside in, in the order of their distance
-to the nearest cell that is not free. Only cells whose loss changes neither pieces nor holes go, so
-the medial cells have the pieces and the rings of those places, by construction. Cells half-way
-between two walls that face each other stay, so that dead ends do.
+The free configurations of a disc-shaped robot (the cells where its centre may be) are thinned from
+the outside in, in the order of their distance to the nearest obstacle. Only simple cells are
+removed, those whose removal changes neither connected components nor holes; so the medial cells
+have the components and the holes of the free configurations by construction. Cells half-way
+between two facing walls are anchors: they are kept, and so dead ends do not shrink away.
 """
 
 from typing import NamedTuple
@@ -12,22 +13,30 @@ import numpy as np
 from scipy import ndimage
 
 _ROUND = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
-"""The eight cells around a cell, in order."""
+"""Offsets of the eight neighbours of a cell, in circular order; bit k of a pattern is the k-th."""
 
 _EIGHT = np.ones((3, 3), bool)
 
 
 class Places(NamedTuple):
-    """Where the centre of a robot may be."""
+    """Free configurations of a disc-shaped robot, H x W cells.
 
-    room: np.ndarray  # (H, W) float64 [cells] to the edge of the nearest cell that is not free
-    foot: np.ndarray  # (2, H, W) int index of that cell
-    inside: np.ndarray  # (H, W) int region of the robot's centre, 1 for the largest; 0 for none
-    sizes: np.ndarray  # (K,) int [cells] of each region, falling
+    Attributes:
+        room: (H, W) float64 [cells] distance to the edge of the nearest cell that is not free.
+        foot: (2, H, W) int index of that cell; it may lie one cell beyond the grid.
+        inside: (H, W) int connected region of free configurations, 1 for the largest; 0 where the
+            robot does not fit.
+        sizes: (K,) int [cells] size of each region, descending.
+    """
+
+    room: np.ndarray
+    foot: np.ndarray
+    inside: np.ndarray
+    sizes: np.ndarray
 
 
 def free_space(occupied: np.ndarray, free: np.ndarray, *, speck: float, gap: float) -> np.ndarray:
-    """Free cells (H, W) bool, specks in them filled.
+    """Free cells (H, W) bool, with small islands filled.
 
     Args:
         occupied: (H, W) bool.
@@ -38,57 +47,86 @@ def free_space(occupied: np.ndarray, free: np.ndarray, *, speck: float, gap: flo
     free = free & ~occupied
     island, count = ndimage.label(~free, structure=_EIGHT)
     boxes = ndimage.find_objects(island)
-    wall = np.zeros(count + 1, bool)
-    wall[np.unique(island[occupied])] = True
+    has_wall = np.zeros(count + 1, bool)
+    has_wall[np.unique(island[occupied])] = True
     filled = np.zeros(count + 1, bool)
     for k, box in enumerate(boxes, start=1):
-        inner = all(s.start > 0 and s.stop < n for s, n in zip(box, free.shape, strict=True))
-        width = max(s.stop - s.start for s in box)
-        filled[k] = inner and width <= (speck if wall[k] else max(speck, gap))
+        enclosed = all(s.start > 0 and s.stop < n for s, n in zip(box, free.shape, strict=True))
+        width = max(side.stop - side.start for side in box)
+        filled[k] = enclosed and width <= (speck if has_wall[k] else max(speck, gap))
     return free | filled[island]
 
 
 def places(free: np.ndarray, *, clearance: float) -> Places:
-    """Regions of free cells (H, W) bool in which a robot of radius `clearance` [cells] fits.
+    """Regions of free cells in which a disc-shaped robot fits.
 
-    What lies beyond the grid is not free.
+    Args:
+        free: (H, W) bool; what lies beyond the grid is not free.
+        clearance: [cells] radius of the robot.
     """
-    distance, foot = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
-    inner = np.s_[1:-1, 1:-1]
-    room = distance[inner] - 0.5
-    inside, count = ndimage.label(room >= clearance, structure=_EIGHT)
-    sizes = np.bincount(inside.ravel(), minlength=count + 1)[1:]
+    to_centre, foot = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
+    to_edge = to_centre[1:-1, 1:-1] - 0.5
+    region, count = ndimage.label(to_edge >= clearance, structure=_EIGHT)
+    sizes = np.bincount(region.ravel(), minlength=count + 1)[1:]
     order = np.argsort(-sizes, kind="stable")
-    rank = np.zeros(count + 1, inside.dtype)
+    rank = np.zeros(count + 1, region.dtype)
     rank[1 + order] = np.arange(1, count + 1)
-    return Places(room, foot[:, 1:-1, 1:-1] - 1, rank[inside], sizes[order])
+    return Places(to_edge, foot[:, 1:-1, 1:-1] - 1, rank[region], sizes[order])
 
 
 def facing(space: Places, wall: np.ndarray, *, angle: float) -> np.ndarray:
-    """Cells (H, W) bool between two things that, seen from the cell, are `angle` [rad] apart.
+    """Cells half-way between two obstacles that face each other, the anchors of dead ends.
 
-    Two neighbours whose nearest obstacles lie far apart have the medial axis between them. Unknown
-    cells keep the robot out but are no walls: one of the two at least must be `wall` (H, W) bool.
+    Two neighbouring cells whose nearest obstacles f1 and f2 lie far from each other have the medial
+    axis between them. With d the larger of their distances to these, f1 and f2 appear under an
+    angle of at least `angle` if |f1 - f2| >= 2 d sin(angle / 2):
+
+        ### f1 ####################
+             |
+             | d1          d = max(d1, d2)
+            [ ][ ]
+                | d2
+        ####### f2 ################
+
+    Of the two cells the one farther from its obstacle is marked.
+
+    Args:
+        space: Free configurations.
+        wall: (H, W) bool; unknown cells keep the robot out but are no walls, and one of the two
+            obstacles must be a wall.
+        angle: [rad] between the two obstacles, at least.
+
+    Returns:
+        (H, W) bool.
     """
     inside = space.inside > 0
-    kept = np.zeros(inside.shape, bool)
-    shape = np.array(inside.shape)[:, None, None] - 1
-    real = wall[tuple(np.clip(space.foot, 0, shape))]
+    anchors = np.zeros(inside.shape, bool)
+    last_index = np.array(inside.shape)[:, None, None] - 1
+    is_wall = wall[tuple(np.clip(space.foot, 0, last_index))]
     distance = space.room + 0.5
     for low, high in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
         apart = np.hypot(*(space.foot[(slice(None), *low)] - space.foot[(slice(None), *high)]))
-        wide = apart >= 2 * np.sin(0.5 * angle) * np.maximum(distance[low], distance[high])
-        wide &= inside[low] & inside[high] & (real[low] | real[high])
-        upper = distance[high] > distance[low]
-        kept[low] |= wide & ~upper
-        kept[high] |= wide & upper
-    return kept
+        between = apart >= 2 * np.sin(0.5 * angle) * np.maximum(distance[low], distance[high])
+        between &= inside[low] & inside[high] & (is_wall[low] | is_wall[high])
+        high_is_farther = distance[high] > distance[low]
+        anchors[low] |= between & ~high_is_farther
+        anchors[high] |= between & high_is_farther
+    return anchors
 
 
 def medial(space: Places, regions: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Medial cells (H, W) bool, one cell thin, of the regions that `regions` (H, W) bool picks.
+    """Medial cells of some regions of the free configurations, one cell thin.
 
-    `kept` (H, W) bool are the cells that hold dead ends.
+    Two passes: the first thins down to the anchors and shortens every branch without one; the
+    second thins what is left between clustered anchors and keeps the tips of branches.
+
+    Args:
+        space: Free configurations.
+        regions: (H, W) bool, the cells of the regions.
+        kept: (H, W) bool, anchors: cells that hold dead ends.
+
+    Returns:
+        (H, W) bool.
     """
     level = (4.0 * space.room).astype(np.int64)
     rough = _thin(regions, level, kept, ends=False)
@@ -96,54 +134,80 @@ def medial(space: Places, regions: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _rules() -> tuple[np.ndarray, np.ndarray]:
-    """Of each pattern (256,) around a cell: whether the cell is simple, and how many are set.
+    """For each pattern (256,) of the eight neighbours: is the cell simple, how many are set.
 
-    A cell is simple if its loss changes neither pieces nor holes: its eight neighbours hold one
-    piece (8-connected) and one piece of background (4-connected) that touches it.
+    A cell is simple if its removal changes neither components nor holes: its neighbours hold one
+    component (8-connected) and one component of background (4-connected) that touches it. This is
+    so if its 8-connectivity number is 1. With b_k = 1 for a background neighbour, k in circular
+    order from a side neighbour,
+
+        N = sum over k in {0, 2, 4, 6} of  b_k - b_k b_(k+1) b_(k+2)
+
+          # # #             # # #              # = set
+          . x .   N = 2     . x #   N = 1      left: removing x would join the two sides
+          # # #             . # #              right: x is simple
 
     References:
         Yokoi, Toriwaki, Fukumura (1975), An analysis of topological properties of digitized
         binary pictures using local features.
     """
     pattern = np.arange(256)
-    clear = [1 - ((pattern >> (k % 8)) & 1) for k in range(9)]
-    number = sum(clear[k] - clear[k] * clear[k + 1] * clear[k + 2] for k in (0, 2, 4, 6))
-    return number == 1, 8 - sum(clear[:8])
+    background = [1 - ((pattern >> (k % 8)) & 1) for k in range(9)]
+    number = sum(
+        background[k] - background[k] * background[k + 1] * background[k + 2] for k in (0, 2, 4, 6)
+    )
+    return number == 1, 8 - sum(background[:8])
 
 
 _SIMPLE, _COUNT = _rules()
 
 
 def _thin(cells: np.ndarray, level: np.ndarray, kept: np.ndarray, *, ends: bool) -> np.ndarray:
-    """Take simple cells away, level by level, as long as there are any.
+    """Remove simple cells, level by level, as long as there are any.
+
+        for each level, ascending:
+            pending = removable cells of this level
+            while pending:
+                for each of the four parity classes, one after the other:
+                    remove all pending cells of the class that are simple
+                pending = remaining removable cells, of this level or lower, beside a removed one
+
+    Cells of one class do not touch, so removing them at once is the same as one by one:
+
+        0 1 0 1
+        2 3 2 3      parity class = 2 (row mod 2) + (column mod 2)
+        0 1 0 1
 
     Args:
         cells: (H, W) bool.
-        level: (H, W) int, the order; a cell that may not go at its level is tried again whenever
-            a neighbour has gone.
-        kept: (H, W) bool, cells that stay.
-        ends: Whether a cell with one neighbour stays.
+        level: (H, W) int, the order of removal; a cell that is not simple when its level comes is
+            tried again whenever a neighbour has been removed.
+        kept: (H, W) bool, cells that are never removed.
+        ends: Whether a cell with a single neighbour, the tip of a branch, is kept.
+
+    Returns:
+        (H, W) bool.
     """
+    # Flat indices of a padded grid: neighbours are at constant offsets, and all of them exist.
     width = cells.shape[1] + 2
-    on = np.pad(cells, 1).ravel()
-    may = on & ~np.pad(kept, 1).ravel()
+    is_set = np.pad(cells, 1).ravel()
+    removable = is_set & ~np.pad(kept, 1).ravel()
     level = np.pad(level, 1).ravel()
-    # Cells of one row parity and column parity do not touch: they can go at the same time.
     parity = np.add.outer(2 * (np.arange(cells.shape[0] + 2) % 2), np.arange(width) % 2).ravel()
-    steps = np.array([i * width + j for i, j in _ROUND])
-    weights = 1 << np.arange(8)
-    order = np.flatnonzero(may)
+    offsets = np.array([row * width + column for row, column in _ROUND])
+    bits = 1 << np.arange(8)
+    order = np.flatnonzero(removable)
     order = order[np.argsort(level[order], kind="stable")]
     levels, first = np.unique(level[order], return_index=True)
-    for now, pending in zip(levels, np.split(order, first[1:]), strict=True):
+    for current, pending in zip(levels, np.split(order, first[1:]), strict=True):
         while pending.size:
-            lost = []
-            for own in range(4):
-                tried = pending[parity[pending] == own]
-                pattern = on[tried[:, None] + steps] @ weights
-                loses = _SIMPLE[pattern] & ~(ends & (_COUNT[pattern] == 1))
-                on[tried[loses]] = False
-                lost.append(tried[loses])
-            near = np.unique(np.concatenate(lost)[:, None] + steps)
-            pending = near[on[near] & may[near] & (level[near] <= now)]
-    return on.reshape(-1, width)[1:-1, 1:-1]
+            removed = []
+            for parity_class in range(4):
+                tried = pending[parity[pending] == parity_class]
+                pattern = is_set[tried[:, None] + offsets] @ bits
+                remove = _SIMPLE[pattern] & ~(ends & (_COUNT[pattern] == 1))
+                is_set[tried[remove]] = False
+                removed.append(tried[remove])
+            beside = np.unique(np.concatenate(removed)[:, None] + offsets)
+            pending = beside[is_set[beside] & removable[beside] & (level[beside] <= current)]
+    return is_set.reshape(-1, width)[1:-1, 1:-1]

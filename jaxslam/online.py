@@ -1,8 +1,22 @@
-"""A drive mapped as its scans come in: odometry from scans, filter, topological map.
+"""SLAM on a log as its scans come in: scan matching, filter, topological map.
 
-Scans are taken `STRETCH` at a time by programs that know neither the length of the drive nor, up
-to a step, the number of its landmarks: what is compiled for one log serves all by that scanner.
-Where the robot is, and the map, are there after each stretch.
+Scans are processed in chunks of `STRETCH` by programs of fixed shape, which depend neither on the
+length of the log nor, up to steps of `ROOM` slots, on the number of landmarks: what is compiled for
+one log serves all logs of that scanner. Pose and map are available after each chunk.
+
+Each chunk passes two stages. The front end (features, arcs, scan matching) needs the chunk's scans
+and the last local map of the scan matcher, but not the filter; so the front end of chunk k + 1 is
+started before the filter of chunk k, and the two overlap:
+
+    time --->
+    front end    | features 0 | features 1 | features 2 |
+                 | matching 0 | matching 1 | matching 2 |
+    filter                    | filter 0   | filter 1   | filter 2 |
+    callback                               ^ 0          ^ 1        ^ 2
+
+Features and matching of a chunk do not depend on each other: one is started by a worker thread, the
+other by the main thread, so that neither waits for the other to be compiled or to run. JAX
+dispatches asynchronously; the main thread waits only for the results of the filter.
 """
 
 from collections.abc import Callable
@@ -29,66 +43,104 @@ from jaxslam.slam import Config, Info, Inputs
 from jaxslam.topomap import Arcs, Graph
 from jaxslam.types import Array
 
-STRETCH = 64  # scans
-ROOM = 384  # slots by which the map of the filter grows
-SPARE = 128  # free ones at the beginning of a stretch, at least
-ROUNDS = 2  # of finding closures at most, each from the way that the one before left,
-STILL = 0.3  # [m] if it left any pose this far from where it was
-LIKE = 512  # scans, or landmarks: runs are smoothed as if they had a multiple of them
-MOST = 2048  # slots, unless told otherwise: what a building of some kilometres of corridor has
+STRETCH = 64  # scans of a chunk
+ROOM = 384  # slots by which the capacity of the filter's map grows
+SPARE = 128  # free slots at the beginning of a chunk, at least
+ROUNDS = 2  # searches for loop closures at most, each from the trajectory smoothed before it;
+STILL = 0.3  # [m] the search ends when no pose has moved further than this
+LIKE = 512  # numbers of scans and landmarks are padded to multiples of this to be smoothed
+MOST = 2048  # default capacity for landmarks: a building with some kilometres of corridors
 
 
 class Mapper(NamedTuple):
-    """All that is known after some scans, and all that the next ones need."""
+    """State of incremental SLAM: the estimate after some scans, and what the next ones need.
+
+    Attributes:
+        belief: Of the filter.
+        arcs: Of the topological map.
+        local: Local map of the scan matcher; None where scans are not matched.
+    """
 
     belief: Belief
     arcs: Arcs
-    local: LocalMap | None  # of aligned scans; None where odometry is that of the wheels
+    local: LocalMap | None
 
 
 class Part(NamedTuple):
-    """What some scans in a row gave; NumPy arrays that lead with their number."""
+    """Result of a chunk of N scans; NumPy arrays that lead with N.
+
+    Attributes:
+        info: Diagnostics of the filter.
+        nodes: Features.
+        aligned: Motions by scan matching; None where scans are not matched.
+    """
 
     info: Info
     nodes: Nodes
-    aligned: Aligned | None  # motions by scans, where they are aligned
+    aligned: Aligned | None
 
 
 class Survey(NamedTuple):
-    """A drive, mapped, with its topological map."""
+    """Result of SLAM on a log of T scans.
 
-    poses: np.ndarray  # (T, 3) float64, world frame, as they are known at the end
-    belief: Belief  # at the end; if smoothed, its places are, with the filter's covariance
-    info: Info  # [T] of the filter: what was known by then
-    nodes: Nodes  # [T]
+    Attributes:
+        poses: (T, 3) float64 [m, m, rad] estimated trajectory, map frame: filtered, or smoothed.
+        belief: Of the filter after the last scan; if smoothed, with the smoothed last pose and
+            landmark positions, and still the covariance of the filter.
+        info: [T] diagnostics of the filter, with its estimates at the time.
+        nodes: [T] features.
+        graph: Topological map.
+        aligned: [T] motions by scan matching, where scans were matched.
+        closures: Loop closures that the trajectory was smoothed with, where there were any.
+    """
+
+    poses: np.ndarray
+    belief: Belief
+    info: Info
+    nodes: Nodes
     graph: Graph
-    aligned: Aligned | None = None  # [T] motions by scans, where they were aligned
-    closures: Closures | None = None  # that it was smoothed with, where they were
+    aligned: Aligned | None = None
+    closures: Closures | None = None
 
 
-class _Seen(NamedTuple):
-    """A stretch of scans, looked at, filled up with its last scan."""
+class _Chunk(NamedTuple):
+    """Output of the front end for a chunk of scans, padded with its last scan.
 
-    count: Array  # () int32 scans that there are
-    scans: Scan  # [STRETCH]
-    inputs: Inputs  # [STRETCH]
-    links: Links  # [STRETCH]
-    local: LocalMap | None  # after them
+    Attributes:
+        count: () int32 number of scans without the padding.
+        scans: [STRETCH].
+        inputs: [STRETCH] measurements for the filter.
+        links: [STRETCH] arcs of each scan.
+        local: Local map of the scan matcher after the chunk; None where scans are not matched.
+    """
+
+    count: Array
+    scans: Scan
+    inputs: Inputs
+    links: Links
+    local: LocalMap | None
+
+
+class _State(NamedTuple):
+    """What the filter stage carries from scan to scan."""
+
+    belief: Belief
+    arcs: Arcs
 
 
 @partial(programs.jit, static_argnames=("config", "aligned"))
 def begin(config: Config, start: Array, *, aligned: bool) -> Mapper:
-    """A robot at a pose (3,) with an empty map.
+    """State before the first scan: a known pose and an empty map.
 
     Args:
-        config: Of the filter; `landmarks` is how many the map may come to hold.
-        start: First pose, world frame.
-        aligned: Whether scans are to be aligned and fused with the wheels.
+        config: Of the filter; `landmarks` is the largest number of landmarks of the map.
+        start: (3,) [m, m, rad] first pose, map frame.
+        aligned: Whether scans are to be matched, and the motions fused with the odometry.
     """
-    room = min(ROOM, config.landmarks)
+    capacity = min(ROOM, config.landmarks)
     return Mapper(
-        slam.init(config._replace(landmarks=room), start),
-        topomap.empty(arcs=2 * room),
+        slam.init(config._replace(landmarks=capacity), start),
+        topomap.empty(arcs=2 * capacity),
         alignment.empty(config.alignment, config.lidar) if aligned else None,
     )
 
@@ -96,19 +148,19 @@ def begin(config: Config, start: Array, *, aligned: bool) -> Mapper:
 def extend(
     config: Config, noise: Noise, mapper: Mapper, motions: Array, scans: Scan
 ) -> tuple[Mapper, Part]:
-    """Map the next scans.
+    """Update the state by the next scans.
 
     Args:
-        config: As it began.
-        noise: What the filter assumes.
-        mapper: After the scans before.
-        motions: (N, 3) odometry since the scan before, N at most `STRETCH`.
+        config: The same as at the beginning.
+        noise: Noise parameters of the filter.
+        mapper: State after the scans before.
+        motions: (N, 3) [m, m, rad] odometry since the scan before, N at most `STRETCH`.
         scans: [N].
 
     Raises:
         ValueError: There is no scan, or there are too many.
     """
-    return _learn(config, noise, mapper, _look(config, mapper.local, motions, scans))
+    return _filter(config, noise, mapper, _front_end(config, mapper.local, motions, scans))
 
 
 def survey(
@@ -122,48 +174,46 @@ def survey(
     smooth: bool = False,
     watch: Callable[[Mapper, Part], Any] | None = None,
 ) -> Survey:
-    """Map a whole drive.
+    """Run SLAM on a whole log.
 
-    The filter tells each pose by what was seen up to it. If it is to be smoothed, all poses and
-    places are told by all that was seen (`sparse.smooth`), and where scans are aligned, those of
-    later visits to a place are laid on those of earlier ones (`closures.find`).
+    The filter estimates each pose from the measurements up to it. With `smooth`, all poses and
+    landmarks are estimated from all measurements (`sparse.smooth`), and where scans are matched,
+    loops are closed by matching scans of later visits with those of earlier ones (`closures.find`).
 
     Args:
-        config: Of front end and filter; `landmarks` is how many the map may come to hold.
-        noise: What the filter assumes.
-        start: (3,) first pose.
-        motions: (T, 3) odometry since the scan before, zero at the first.
+        config: Of front end and filter; `landmarks` is the largest number of landmarks of the map.
+        noise: Noise parameters of the filter.
+        start: (3,) [m, m, rad] first pose, map frame.
+        motions: (T, 3) [m, m, rad] odometry since the scan before, zero at the first.
         scans: [T].
-        aligned: Whether scans are to be aligned and fused with the wheels.
-        smooth: Whether the drive is to be smoothed at the end.
-        watch: Called after each stretch with what is known by then, and what the stretch gave.
+        aligned: Whether scans are to be matched, and the motions fused with the odometry.
+        smooth: Whether the trajectory is to be smoothed at the end.
+        watch: Callback, called after each chunk with the state and the result of the chunk.
+
+    Raises:
+        ValueError: There is no scan; or scans are to be matched and `noise.alignment` is None.
     """
-    # Slices of JAX's own arrays would each be compiled.
+    # NumPy, as each slice of a JAX array would be compiled.
     motions, scans = np.asarray(motions), jax.tree.map(np.asarray, scans)
     mapper, parts = begin(config, start, aligned=aligned), []
-
-    def look(first: int, local: LocalMap | None) -> _Seen:
-        some = slice(first, first + STRETCH)
-        return _look(config, local, motions[some], jax.tree.map(lambda x: x[some], scans))
-
-    # The next stretch is looked at while the filter works on the last.
-    seen = look(0, mapper.local)
+    following = _front_end(config, mapper.local, *_chunk_at(0, motions, scans))
     for first in range(0, len(motions), STRETCH):
-        now, after = seen, first + STRETCH
-        seen = look(after, now.local) if after < len(motions) else None
-        mapper, part = _learn(config, noise, mapper, now)
+        chunk, after = following, first + STRETCH
+        if after < len(motions):  # in the background while the filter works on this chunk
+            following = _front_end(config, chunk.local, *_chunk_at(after, motions, scans))
+        mapper, part = _filter(config, noise, mapper, chunk)
         parts.append(part)
         if watch is not None:
             watch(mapper, part)
-    whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    info, poses, found = whole.info, np.asarray(whole.info.pose, np.float64), None
+    info, features, matched = jax.tree.map(lambda *chunks: np.concatenate(chunks), *parts)
+    poses, found = np.asarray(info.pose, np.float64), None
     if smooth:
-        inputs = Inputs(motions.astype(info.pose.dtype), whole.nodes, aligned=whole.aligned)
-        given = inputs, info, mapper.belief, scans if aligned else None
-        poses, belief, found = smoothed(config, noise, start, *given)
+        inputs = Inputs(motions.astype(info.pose.dtype), features, aligned=matched)
+        to_close = scans if aligned else None
+        poses, belief, found = smoothed(config, noise, start, inputs, info, mapper.belief, to_close)
         mapper = mapper._replace(belief=belief)
-    told = graph(config, mapper, poses)
-    return Survey(poses, mapper.belief, info, whole.nodes, told, whole.aligned, found)
+    topological_map = graph(config, mapper, poses)
+    return Survey(poses, mapper.belief, info, features, topological_map, matched, found)
 
 
 _records = programs.jit(smoother.records, static_argnames="doubt")
@@ -178,56 +228,104 @@ def smoothed(
     belief: Belief,
     scans: Scan | None = None,
 ) -> tuple[np.ndarray, Belief, Closures | None]:
-    """A filtered drive by all that was seen on it.
+    """Smooth a filtered trajectory by all its measurements.
+
+        smooth with the filter's data association
+        up to ROUNDS times:
+            find loop closures from the smoothed trajectory, smooth again with them
+            stop if no pose has moved by STILL or more
 
     Args:
         config: Of the filter.
-        noise: What it assumed.
-        start: (3,) its first pose.
-        inputs: [T] it was given, NumPy.
-        info: [T] what it found, NumPy.
-        belief: At the end.
-        scans: [T] to close loops with, NumPy; None to close none but the filter's.
+        noise: Noise parameters of the filter.
+        start: (3,) [m, m, rad] first pose, map frame.
+        inputs: [T] measurements of the filter, NumPy.
+        info: [T] its diagnostics, NumPy.
+        belief: After the last scan.
+        scans: [T] to find loop closures with, NumPy; None for none but the filter's own.
 
     Returns:
-        Poses (T, 3) float64, the belief with the last of them and the places that go with them,
-        whose covariances are still the filter's, and what loops were closed.
+        Poses (T, 3) float64; the belief with the smoothed last pose and landmark positions, and the
+        covariance of the filter; and the loop closures, None without scans.
 
     Raises:
         ValueError: There are scans, and `noise.alignment` is None.
     """
     if scans is not None and noise.alignment is None:
         raise ValueError("noise.alignment is None, and there are scans to close loops with")
-    steps, room = len(info.pose), lambda count: (count // LIKE + 1) * LIKE
-    found = association.landmarks(
-        info.id, info.pose, inputs.nodes, size=room(np.count_nonzero(np.unique(info.id) >= 0))
-    )
-    # The rest stands still and sees nothing.
-    inputs, which, guess = pad((inputs, np.asarray(found.which), info.pose), to=room(steps))
-    which[steps:] = -1
-    for motion in jax.tree.leaves((inputs.motion, inputs.aligned and inputs.aligned.motion)):
-        motion[steps:] = 0.0
-    records = _records(noise, start, inputs, which, doubt=config.doubt)
+    steps = len(info.pose)
+    capacity = _padded(np.count_nonzero(np.unique(info.id) >= 0))
+    found = association.landmarks(info.id, info.pose, inputs.nodes, size=capacity)
+    records, guess = _padded_records(config, noise, start, inputs, found.which, info.pose)
     track, closed = sparse.smooth(records, guess, found.places), None
     for _ in range(0 if scans is None else ROUNDS):
-        how = config.closures, config.alignment, config.lidar, track.poses[:steps], scans
-        closed, before = closures.find(*how, scale=float(noise.alignment)), track.poses
+        before = track.poses
+        closed = closures.find(
+            config.closures,
+            config.alignment,
+            config.lidar,
+            before[:steps],
+            scans,
+            scale=float(noise.alignment),
+        )
         track = sparse.smooth(records, before, track.places, closures=closed)
         if np.max(np.abs(track.poses - before)[:, :2]) < STILL:
             break
-    # The names are in order, and no landmark has the name that fills up the end.
-    names = np.asarray(found.id)
-    names = np.where(names < 0, np.iinfo(names.dtype).max, names)
-    at = np.searchsorted(names, belief.id)
-    same = (np.asarray(belief.seen) > 0) & (names[at] == np.asarray(belief.id))
-    places = np.where(same[:, None], track.places[at], belief.places)
     poses = track.poses[:steps]
-    mean = np.concatenate([poses[-1], places.ravel()])
+    positions = _positions_of(belief, np.asarray(found.id), track.places)
+    mean = np.concatenate([poses[-1], positions.ravel()])
     return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype)), closed
 
 
+def _padded(count: int) -> int:
+    """The next larger multiple of `LIKE`."""
+    return (count // LIKE + 1) * LIKE
+
+
+def _padded_records(
+    config: Config, noise: Noise, start: Array, inputs: Inputs, which: Array, guess: np.ndarray
+) -> tuple[smoother.Records, np.ndarray]:
+    """Smoothing problem and guess (P, 3), padded by steps without motion and measurements.
+
+    Args:
+        config: Of the filter.
+        noise: Noise parameters of the filter.
+        start: (3,) first pose.
+        inputs: [T].
+        which: (T, M) landmark of each feature.
+        guess: (T, 3) poses.
+    """
+    steps = len(guess)
+    inputs, which, guess = pad((inputs, np.asarray(which), guess), to=_padded(steps))
+    which[steps:] = -1
+    inputs.motion[steps:] = 0.0
+    if inputs.aligned is not None:
+        inputs.aligned.motion[steps:] = 0.0
+    return _records(noise, start, inputs, which, doubt=config.doubt), guess
+
+
+def _positions_of(belief: Belief, ids: np.ndarray, smoothed_positions: np.ndarray) -> np.ndarray:
+    """Positions (L, 2) of the slots of a belief: smoothed where the landmark was, else as they are.
+
+    Args:
+        belief: The belief.
+        ids: (S,) ids of the smoothed landmarks, ascending; then at least one -1, the padding.
+        smoothed_positions: (S, 2).
+    """
+    ids = np.where(ids < 0, np.iinfo(ids.dtype).max, ids)  # sorts last, and is no landmark's id
+    index = np.searchsorted(ids, belief.id)
+    is_smoothed = (np.asarray(belief.seen) > 0) & (ids[index] == np.asarray(belief.id))
+    return np.where(is_smoothed[:, None], smoothed_positions[index], belief.places)
+
+
 def graph(config: Config, mapper: Mapper, poses: np.ndarray) -> Graph:
-    """The topological map as it stands, of a robot that was at poses (T, 3)."""
+    """Topological map of a state.
+
+    Args:
+        config: Of the filter.
+        mapper: The state.
+        poses: (T, 3) [m, m, rad] trajectory up to it, map frame.
+    """
     return topomap.graph(
         mapper.belief,
         mapper.arcs,
@@ -239,83 +337,109 @@ def graph(config: Config, mapper: Mapper, poses: np.ndarray) -> Graph:
 
 
 def align(config: Config, scans: Scan, motions: Array) -> Aligned:
-    """Motions [T] by scans [T] alone, NumPy, beginning at those of the wheels (T, 3)."""
+    """Motions [T] by scan matching alone, NumPy.
+
+    Args:
+        config: Of the scan matcher.
+        scans: [T].
+        motions: (T, 3) [m, m, rad] odometry since the scan before, the first guess.
+    """
     motions, scans = np.asarray(motions), jax.tree.map(np.asarray, scans)
     local, parts = alignment.empty(config.alignment, config.lidar), []
     for first in range(0, len(motions), STRETCH):
-        some = jax.tree.map(lambda x: x[first : first + STRETCH], (scans, motions))  # noqa: B023
-        local, part = alignment.follow(config.alignment, config.lidar, local, *_filled(*some))
+        padded_scans, odometry, count = _padded_chunk(*_chunk_at(first, motions, scans))
+        local, part = alignment.follow(
+            config.alignment, config.lidar, local, padded_scans, odometry, count
+        )
         parts.append(part)
-    return jax.tree.map(lambda *x: np.concatenate(x)[: len(motions)], *parts)
+    return jax.tree.map(lambda *chunks: np.concatenate(chunks)[: len(motions)], *parts)
 
 
-def _filled(scans: Scan, motions: np.ndarray) -> tuple[Scan, Array, Array]:
-    """Scans and motions of a stretch, filled up, in JAX's precision, and how many () there are."""
-    real = lambda x: jnp.asarray(x, float if x.dtype.kind == "f" else None)
-    return *jax.tree.map(real, pad((scans, motions), to=STRETCH)), jnp.int32(len(motions))
+def _chunk_at(first: int, motions: np.ndarray, scans: Scan) -> tuple[np.ndarray, Scan]:
+    """Odometry and scans of the chunk that begins at an index."""
+    return jax.tree.map(lambda x: x[first : first + STRETCH], (motions, scans))
 
 
-def _look(config: Config, local: LocalMap | None, motions: np.ndarray, scans: Scan) -> _Seen:
-    """Features, links and, with a local map of scans, aligned motions of a stretch."""
+def _padded_chunk(motions: np.ndarray, scans: Scan) -> tuple[Scan, Array, Array]:
+    """Scans and odometry of a chunk, padded, in JAX's precision, and its length () int32."""
+
+    def as_jax(array: np.ndarray) -> Array:
+        return jnp.asarray(array, float if array.dtype.kind == "f" else None)
+
+    padded_scans, odometry = jax.tree.map(as_jax, pad((scans, motions), to=STRETCH))
+    return padded_scans, odometry, jnp.int32(len(motions))
+
+
+def _front_end(config: Config, local: LocalMap | None, motions: np.ndarray, scans: Scan) -> _Chunk:
+    """Features, arcs and, with a local map of the scan matcher, matched motions of a chunk."""
     if not 1 <= len(motions) <= STRETCH:
         raise ValueError(f"{len(motions)} scans; a stretch has 1 to {STRETCH}")
-    scans, motions, count = _filled(scans, motions)
+    scans, odometry, count = _padded_chunk(motions, scans)
     aligned = None
-    with ThreadPoolExecutor(1) as other:  # neither waits for the other, to be compiled or to run
-        features = other.submit(slam.local_maps, config, scans)
+    with ThreadPoolExecutor(1) as worker:  # beside the matching, see the module's diagram
+        features_and_links = worker.submit(slam.local_maps, config, scans)
         if local is not None:
-            how = config.alignment, config.lidar
-            local, aligned = alignment.follow(*how, local, scans, motions, count)
-        nodes, links = features.result()
-    return _Seen(count, scans, Inputs(motions, nodes, aligned=aligned), links, local)
+            local, aligned = alignment.follow(
+                config.alignment, config.lidar, local, scans, odometry, count
+            )
+        features, links = features_and_links.result()
+    return _Chunk(count, scans, Inputs(odometry, features, aligned=aligned), links, local)
 
 
-def _learn(config: Config, noise: Noise, mapper: Mapper, seen: _Seen) -> tuple[Mapper, Part]:
-    """Filter a stretch, and add its links to the map."""
-    belief, arcs = _grown(config, mapper.belief, mapper.arcs)
-    room = config._replace(landmarks=belief.seen.size)
-    (belief, arcs), info = _steps(room, noise, (belief, arcs), seen._replace(local=None))
-    part = Part(info, seen.inputs.nodes, seen.inputs.aligned)
-    part = jax.tree.map(lambda x: np.asarray(x)[: seen.count], part)
-    return Mapper(belief, arcs, seen.local), part
+def _filter(config: Config, noise: Noise, mapper: Mapper, chunk: _Chunk) -> tuple[Mapper, Part]:
+    """Filter a chunk and merge its arcs into the map; waits for the results."""
+    state = _with_capacity(config, _State(mapper.belief, mapper.arcs))
+    sized = config._replace(landmarks=state.belief.seen.size)
+    state, info = _steps(sized, noise, state, chunk._replace(local=None))
+    part = Part(info, chunk.inputs.nodes, chunk.inputs.aligned)
+    part = jax.tree.map(lambda x: np.asarray(x)[: chunk.count], part)
+    return Mapper(state.belief, state.arcs, chunk.local), part
 
 
-def _grown(config: Config, belief: Belief, arcs: Arcs) -> tuple[Belief, Arcs]:
-    """Room for the landmarks of a stretch, and for two arcs of each that there is room for."""
+def _with_capacity(config: Config, state: _State) -> _State:
+    """The map with `SPARE` free slots or more, up to `config.landmarks`; two arcs a landmark."""
+    belief, arcs = state
     size = belief.seen.size
-    to = min(size + ROOM, config.landmarks)
-    if size == to or np.count_nonzero(belief.seen) <= size - SPARE:
-        return belief, arcs
-    return grown(belief, to), topomap.grown(arcs, 2 * to)
+    larger = min(size + ROOM, config.landmarks)
+    if size == larger or np.count_nonzero(belief.seen) <= size - SPARE:
+        return state
+    return _State(grown(belief, larger), topomap.grown(arcs, 2 * larger))
 
 
 @partial(jax.jit, static_argnames="config")
 def _step(
-    config: Config, noise: Noise, now: tuple[Belief, Arcs], inputs: Inputs, links: Links, scan: Scan
-) -> tuple[tuple[Belief, Arcs], Info]:
-    """Filter one scan, and add its links."""
-    cov = make_room(now[0].map_cov, 2 * config.matches + 2)  # and the two of a merge
-    belief, info = slam.step(config, noise, now[0]._replace(map_cov=cov), inputs)
-    arcs = topomap.add(now[1], info.id, info.pose, links, scan, config.lidar)
-    return (belief, arcs), info
+    config: Config, noise: Noise, state: _State, inputs: Inputs, links: Links, scan: Scan
+) -> tuple[_State, Info]:
+    """Filter one scan, and merge its arcs into the map."""
+    cov = make_room(state.belief.map_cov, 2 * config.matches + 2)  # and two rows of a merge
+    belief, info = slam.step(config, noise, state.belief._replace(map_cov=cov), inputs)
+    arcs = topomap.add(state.arcs, info.id, info.pose, links, scan, config.lidar)
+    return _State(belief, arcs), info
 
 
 @partial(programs.jit, static_argnames="config")
-def _steps(
-    config: Config, noise: Noise, now: tuple[Belief, Arcs], seen: _Seen
-) -> tuple[tuple[Belief, Arcs], Info]:
-    """Filter the scans that there are; the info of the rest of the stretch is blank."""
-    given = seen.inputs, seen.links, seen.scans
-    at = lambda k: jax.tree.map(lambda x: x[k], given)
+def _steps(config: Config, noise: Noise, state: _State, chunk: _Chunk) -> tuple[_State, Info]:
+    """Filter the scans of a chunk one after the other; the info of its padding is zero.
 
-    def body(k: Array, all: tuple[tuple[Belief, Arcs], Info]) -> tuple[tuple[Belief, Arcs], Info]:
-        now, info = _step(config, noise, all[0], *at(k))
-        return now, jax.tree.map(lambda old, new: old.at[k].set(new), all[1], info)
+    Downdates of the map's covariance are deferred within a chunk, except for the right-invariant
+    filter, whose updates move the whole map.
+    """
+    per_scan = chunk.inputs, chunk.links, chunk.scans
 
-    # Jitted, and closing over nothing, a step is traced once for its shapes and for the loop.
-    shapes = jax.eval_shape(_step, config, noise, now, *at(0))[1]
+    def scan_at(k: Array | int) -> tuple[Inputs, Links, Scan]:
+        return jax.tree.map(lambda x: x[k], per_scan)
+
+    def body(k: Array, carry: tuple[_State, Info]) -> tuple[_State, Info]:
+        state, infos = carry
+        state, info = _step(config, noise, state, *scan_at(k))
+        return state, jax.tree.map(lambda old, new: old.at[k].set(new), infos, info)
+
+    # As `_step` is jitted and closes over nothing, it is traced once, for its shapes and the loop.
+    shapes = jax.eval_shape(_step, config, noise, state, *scan_at(0))[1]
     blank = jax.tree.map(lambda x: jnp.zeros((STRETCH, *x.shape), x.dtype), shapes)
-    if config.linearisation != "invariant":  # which swings the whole map at each update
-        now = now[0]._replace(map_cov=postpone(now[0].map_cov)), now[1]
-    (belief, arcs), info = lax.fori_loop(0, seen.count, body, (now, blank))
-    return (belief._replace(map_cov=settle(belief.map_cov)), arcs), info
+    belief = state.belief
+    if config.linearisation != "invariant":
+        belief = belief._replace(map_cov=postpone(belief.map_cov))
+    carry = state._replace(belief=belief), blank
+    (belief, arcs), info = lax.fori_loop(0, chunk.count, body, carry)
+    return _State(belief._replace(map_cov=settle(belief.map_cov)), arcs), info

@@ -1,4 +1,4 @@
-"""What the commands share: checked options, errors that name them, compiled programs, a clock."""
+"""Shared by the commands: checks of options, compilation cache, timing."""
 
 import gc
 import os
@@ -16,11 +16,11 @@ from jaxslam.io import noise as noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.slam import Noise
 
-GARBAGE = 100_000  # objects that come to be, more than go, before garbage is looked for
+GARBAGE = 100_000  # threshold of the garbage collector: net new objects between two collections
 
 
 def within(option: str, value: float, low: float, high: float) -> None:
-    """Raise unless the value of an option is in its range."""
+    """Raise InputError unless the value of an option is in [low, high]."""
     if not low <= value <= high:
         raise InputError(f"{value} is not between {low} and {high}", field=option)
 
@@ -35,15 +35,15 @@ def named(what: str) -> Iterator[None]:
 
 
 def noise_of(path: Path | None, default: Noise) -> Noise:
-    """Noise in a file; the default without one."""
+    """Noise parameters (Q and R) of a file; the default if there is no path."""
     return default if path is None else noise_file.read(path, default)
 
 
 def keep_compiled() -> None:
-    """Keep programs in the user's cache folder, unless JAX was told of another one.
+    """Enable the persistent caches of traced and compiled programs in the user's cache folder.
 
-    Garbage is collected less often from here on: while JAX traces, looking for it takes a quarter
-    of the time.
+    A cache folder that JAX is already configured with is kept. Garbage is collected less often from
+    here on: otherwise garbage collection takes a quarter of the time in which JAX traces.
     """
     gc.freeze()
     gc.set_threshold(GARBAGE)
@@ -63,7 +63,7 @@ def keep_compiled() -> None:
 
 @contextmanager
 def stopwatch() -> Iterator[dict[str, float]]:
-    """Seconds of the block: those of XLA's compiler, and the rest."""
+    """Measure the block: seconds in XLA's compiler (`compile`) and the rest (`run`)."""
     seconds = {"compile": 0.0, "run": 0.0}
     spans = []
 
@@ -73,17 +73,17 @@ def stopwatch() -> Iterator[dict[str, float]]:
             spans.append((now - duration, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    begin, running = perf_counter(), True
+    start, running = perf_counter(), True
     yield seconds
     running = False
     seconds["compile"] = _covered(spans)
-    seconds["run"] = perf_counter() - begin - seconds["compile"]
+    seconds["run"] = perf_counter() - start - seconds["compile"]
 
 
 def _covered(spans: Iterable[tuple[float, float]]) -> float:
-    """Length of what some of the spans, from and to, cover: programs are compiled side by side."""
-    total, end = 0.0, -np.inf
+    """Length of the union of intervals (start, stop): programs are compiled in parallel."""
+    total, covered_until = 0.0, -np.inf
     for start, stop in sorted(spans):
-        total += max(0.0, stop - max(start, end))
-        end = max(end, stop)
+        total += max(0.0, stop - max(start, covered_until))
+        covered_until = max(covered_until, stop)
     return total

@@ -1,4 +1,4 @@
-"""Routes over a map, and how to follow a path."""
+"""Route planning on a topological map (Dijkstra), and path following by pure pursuit."""
 
 from typing import NamedTuple
 
@@ -11,24 +11,26 @@ from jaxslam.motion import arc
 from jaxslam.topomap import Graph
 from jaxslam.types import Array
 
-WINDOW = 40  # points of the path ahead of the robot that are looked at
-SHARP = 0.6  # [rad] a target farther off the bow than this is first turned to
-CLOSE = 0.05  # [m] from the end of its path the robot stops
+WINDOW = 40  # points of the path ahead of the robot that are searched
+SHARP = 0.6  # [rad] the robot turns on the spot to a target at a larger bearing than this
+CLOSE = 0.05  # [m] the robot stops this close to the end of the path
 
 
 def densify(waypoints: np.ndarray, spacing: float = 0.05) -> np.ndarray:
-    """Points (N, 2) about `spacing` [m] apart on the straight lines that join way points (K, 2).
+    """Points (N, 2) about `spacing` [m] apart on the straight lines that join waypoints (K, 2) [m].
+
+    The waypoints are among them.
 
     Raises:
-        ValueError: The way points have another shape.
+        ValueError: The waypoints have another shape.
     """
     if np.ndim(waypoints) != 2 or len(waypoints) < 1 or np.shape(waypoints)[1] != 2:
         raise ValueError(f"waypoints is {np.shape(waypoints)}, not (K >= 1, 2)")
     legs = np.hypot(*np.diff(waypoints, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(legs)])
-    at = np.linspace(0.0, along[-1], round(along[-1] / spacing) + 1)
-    at = np.unique(np.concatenate([at, along]))
-    return np.stack([np.interp(at, along, waypoints[:, k]) for k in range(2)], axis=1)
+    at_waypoint = np.concatenate([[0.0], np.cumsum(legs)])
+    wanted = np.linspace(0.0, at_waypoint[-1], round(at_waypoint[-1] / spacing) + 1)
+    wanted = np.unique(np.concatenate([wanted, at_waypoint]))
+    return np.stack([np.interp(wanted, at_waypoint, waypoints[:, k]) for k in range(2)], axis=1)
 
 
 def follow(
@@ -42,76 +44,102 @@ def follow(
 ) -> tuple[Array, Array]:
     """Motion to make between two scans to follow a path by pure pursuit.
 
-    The arc that starts ahead and leads to a target at distance r and bearing a has the curvature
-    2 sin(a) / r and the length r a / sin(a). A target that lies more than `SHARP` to one side is
-    first turned to on the spot.
+    The circle that starts ahead and leads to a target at distance r and bearing a has the
+    curvature 2 sin(a) / r, and its part up to the target the length r a / sin(a):
+
+               o target           The target is the first point of the path `lookahead` further
+             /  |                 along than the point nearest to the robot. A target at a bearing
+          r / a ' circle          of more than `SHARP` is first turned to on the spot.
+           /   .
+          robot -> ahead
 
     Args:
-        path: (N, 2) points of the path [m, world]; `WINDOW` of them must span the lookahead.
-        place: () int32 index of the path point where the robot was last.
-        pose: (3,) of the robot.
-        lookahead: Distance along the path [m] from the robot's place to its target.
-        stride: Largest distance [m] of the motion.
-        turn: Largest change of heading [rad] of the motion.
+        path: (N, 2) points of the path [m, map frame]; `WINDOW` of them must span the lookahead.
+        place: () int32 index of the path point that was nearest at the last call, 0 at the first.
+        pose: (3,) [m, m, rad] of the robot, map frame.
+        lookahead: [m] distance along the path from the nearest path point to the target.
+        stride: [m] largest length of the motion.
+        turn: [rad] largest change of heading of the motion.
 
     Returns:
-        Motion (3,), zero at the end of the path, and the index () int32 of the nearest path point.
+        Motion (3,) [m, m, rad] in the frame of the robot, zero at the end of the path, and the
+        index () int32 of the nearest path point.
 
     Raises:
         ValueError: The path or the pose has another shape; while tracing.
+
+    References:
+        Coulter (1992), Implementation of the pure pursuit path tracking algorithm.
     """
     if path.ndim != 2 or path.shape[1] != 2:
         raise ValueError(f"path is {path.shape}, not (N, 2)")
     if pose.shape != (3,):
         raise ValueError(f"pose is {pose.shape}, not (3,)")
-    last = path.shape[0] - 1
-    index = jnp.minimum(place + jnp.arange(WINDOW, dtype=place.dtype), last)
-    offset = path[index] - pose[None, :2]
-    place = index[jnp.argmin(jnp.sum(offset**2, axis=1))]
+    nearest, target = _nearest_and_target(path, place, pose, lookahead)
+    distance, bearing = range_bearing(to_robot(pose, path[target]))
 
-    index = jnp.minimum(place + jnp.arange(WINDOW, dtype=place.dtype), last)
-    step = jnp.diff(path[index], axis=0)
-    along = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
-    ahead = jnp.minimum(jnp.sum(along < lookahead) + 1, WINDOW - 1)
-    target = index[ahead]
-    away, bearing = range_bearing(to_robot(pose, path[target]))
-
-    ahead_of = jnp.clip(bearing, -SHARP, SHARP)
-    curvature = 2 * jnp.sin(ahead_of) / jnp.maximum(away, CLOSE)
-    length = jnp.minimum(stride, away / jnp.sinc(ahead_of / jnp.pi))
+    limited = jnp.clip(bearing, -SHARP, SHARP)
+    curvature = 2 * jnp.sin(limited) / jnp.maximum(distance, CLOSE)
+    length = jnp.minimum(stride, distance / jnp.sinc(limited / jnp.pi))
     length = jnp.minimum(length, turn / jnp.maximum(jnp.abs(curvature), turn / stride))
 
-    sharp = jnp.abs(bearing) > SHARP
-    done = (target == last) & (away < CLOSE)
-    length = jnp.where(done | sharp, 0.0, length)
-    swing = jnp.where(sharp, jnp.clip(bearing, -turn, turn), length * curvature)
-    return arc(length, jnp.where(done, 0.0, swing)), place
+    on_the_spot = jnp.abs(bearing) > SHARP
+    done = (target == path.shape[0] - 1) & (distance < CLOSE)
+    length = jnp.where(done | on_the_spot, 0.0, length)
+    rotation = jnp.where(on_the_spot, jnp.clip(bearing, -turn, turn), length * curvature)
+    return arc(length, jnp.where(done, 0.0, rotation)), nearest
+
+
+def _nearest_and_target(
+    path: Array, previous: Array, pose: Array, lookahead: float
+) -> tuple[Array, Array]:
+    """Indices () of the path point nearest to the robot, and of the first `lookahead` [m] on.
+
+    Both are searched in a window of `WINDOW` points, so that a path that crosses itself is followed
+    in order.
+    """
+    last = path.shape[0] - 1
+    index = jnp.minimum(previous + jnp.arange(WINDOW, dtype=previous.dtype), last)
+    offset = path[index] - pose[None, :2]
+    nearest = index[jnp.argmin(jnp.sum(offset**2, axis=1))]
+
+    index = jnp.minimum(nearest + jnp.arange(WINDOW, dtype=previous.dtype), last)
+    step = jnp.diff(path[index], axis=0)
+    along_path = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
+    ahead = jnp.minimum(jnp.sum(along_path < lookahead) + 1, WINDOW - 1)
+    return nearest, index[ahead]
 
 
 class Route(NamedTuple):
-    """A way over a map."""
+    """A path over a topological map.
 
-    nodes: list[int]  # indices of its nodes, in order
-    arcs: list[int]  # indices of the arcs between them
-    line: np.ndarray  # (n, 2) [m, world]
-    length: float  # [m]
+    Attributes:
+        nodes: Indices of its nodes, in order.
+        arcs: Indices of the arcs between them, in order.
+        line: (n, 2) [m] polyline, map frame.
+        length: [m].
+    """
+
+    nodes: list[int]
+    arcs: list[int]
+    line: np.ndarray
+    length: float
 
 
 def route(graph: Graph, start: int, goal: int, *, clearance: float = 0.0) -> Route:
-    """The shortest way over a map.
+    """Shortest path over a topological map.
 
     Args:
         graph: The map.
         start: Index of the first node.
         goal: Index of the last node.
-        clearance: Clearance [m] that each arc must have; above 0, arcs without a known one are
-            not used.
+        clearance: [m] that each arc must have; above 0, arcs without a known one are not used.
 
     Raises:
         ValueError: No arcs of that clearance lead from `start` to `goal`, or there is no such node.
     """
-    wide = (clearance <= 0.0) | (graph.arc_clearance >= clearance)  # NaN compares false
-    lengths = np.where(wide, graph.length, np.inf)
+    usable = (clearance <= 0.0) | (graph.arc_clearance >= clearance)  # NaN compares false
+    lengths = np.where(usable, graph.length, np.inf)
     arcs = ways.shortest(graph.pairs, lengths, start, goal, places=len(graph.xy))
     nodes, line = ways.along(graph.lines, graph.pairs, arcs, start)
     line = line if arcs else graph.xy[[start]]

@@ -1,4 +1,4 @@
-"""Poses of logs: SE(2) in NumPy and float64, whatever JAX's precision."""
+"""SE(2) poses in NumPy and float64, for logs and metrics; `geometry` is the same in JAX."""
 
 import numpy as np
 
@@ -10,36 +10,47 @@ def by_time(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def interpolate(wanted: np.ndarray, times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (K, 3) at times (K,), linearly between those of (N,) sorted times."""
+    """Poses (K, 3) at times (K,) [s], linearly between poses (N, 3) at sorted times (N,) [s]."""
     columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
     return np.stack([np.interp(wanted, times, column) for column in columns], axis=-1)
 
 
 def composed(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """As `geometry.compose`, for (..., 3)."""
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + c * motion[..., 0] - s * motion[..., 1]
-    y = pose[..., 1] + s * motion[..., 0] + c * motion[..., 1]
+    """Poses (..., 3) after motions (..., 3), given in their frames; as `geometry.compose`."""
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x = pose[..., 0] + cos * motion[..., 0] - sin * motion[..., 1]
+    y = pose[..., 1] + sin * motion[..., 0] + cos * motion[..., 1]
     return np.stack([x, y, _wrap(pose[..., 2] + motion[..., 2])], axis=-1)
 
 
 def seen_from(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (..., 3) in the frames of others (..., 3), as `geometry.between`."""
-    c, s = np.cos(frames[..., 2]), np.sin(frames[..., 2])
-    d = poses - frames
-    x, y = c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]
-    return np.stack([x, y, _wrap(d[..., 2])], axis=-1)
+    """Poses (..., 3) relative to the frames (..., 3), in them; as `geometry.between`."""
+    cos, sin = np.cos(frames[..., 2]), np.sin(frames[..., 2])
+    gap = poses - frames
+    x, y = cos * gap[..., 0] + sin * gap[..., 1], cos * gap[..., 1] - sin * gap[..., 0]
+    return np.stack([x, y, _wrap(gap[..., 2])], axis=-1)
 
 
 def placed(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (..., 2) of the frames of poses (..., 3), in the world; as `geometry.to_world`."""
-    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    """Transform points (..., 2) [m] from the frames of poses (..., 3) to that of the poses.
+
+    As `geometry.to_world`.
+    """
+    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     x, y = points[..., 0], points[..., 1]
-    return np.stack([poses[..., 0] + c * x - s * y, poses[..., 1] + s * x + c * y], axis=-1)
+    return np.stack([poses[..., 0] + cos * x - sin * y, poses[..., 1] + sin * x + cos * y], axis=-1)
 
 
 def chain(moves: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Poses (N + 1, 3) from a start (3,), zero by default, by moves (N, 3) in the frame before."""
+    """Trajectory of increments: dead reckoning.
+
+    Args:
+        moves: (N, 3) increments, each in the frame of the pose before it.
+        start: (3,) first pose; zero by default.
+
+    Returns:
+        (N + 1, 3) poses.
+    """
     poses = np.zeros((len(moves) + 1, 3))
     poses[0] = 0.0 if start is None else start
     for i, move in enumerate(moves):

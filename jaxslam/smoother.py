@@ -1,8 +1,13 @@
-"""Batch smoother: all poses of a run and all its landmarks at once, with the matches held fixed.
+"""Batch smoother: Gauss-Newton over all poses and landmarks, with the data association held fixed.
 
-The filter keeps the last pose only, and linearises once, where it stood then. Here Gauss-Newton
-goes over the same records until nothing moves: that polishes a run of the filter, and tells how
-much the filter left on the table.
+The filter keeps the last pose only, and linearises each measurement once, at the estimate of that
+time. Gauss-Newton relinearises all measurements at the smoothed estimate until it converges. This
+improves a filter's result, and shows how much accuracy the filter loses.
+
+    repeat:
+        linearise all residuals at the state             `evaluate`
+        solve the arrowhead normal equations             `arrow.solve`
+        halve the step until the cost does not rise      `_step_size`
 
 References:
     Lu, Milios (1997), Globally consistent range scan alignment for environment mapping. Dellaert,
@@ -25,36 +30,59 @@ from jaxslam.noise import Noise, sensor_noise
 from jaxslam.slam import Inputs, moved
 from jaxslam.types import WALL, Array, expect
 
-FLOOR = 1e-4  # [m], [rad] std that is added to each motion: a robot that stands still has none
-HALVINGS = 6  # of a step that raises the cost; after these it is not taken
+FLOOR = 1e-4  # [m], [rad] std added to each odometry increment: that of a robot at rest is zero
+HALVINGS = 6  # of a step that raises the cost, at most; after these it is not taken
 
 
 class Prior(NamedTuple):
-    """What is known of the landmarks beforehand."""
+    """Prior of the landmarks.
 
-    places: Array  # (L, 2)
-    information: Array  # (L, 2, 2) inverse covariance; zero where nothing is known
+    Attributes:
+        places: (L, 2) mean, as in `Track`.
+        information: (L, 2, 2) inverse covariance; zero where nothing is known.
+    """
+
+    places: Array
+    information: Array
 
 
 class Records(NamedTuple):
-    """What one robot was told, and how well."""
+    """The batch problem of one robot: odometry, landmark measurements, and their covariances.
 
-    start: Array  # (3,) known pose before the first motion, world frame
-    motion: Array  # (T, 3) odometry since the pose before
-    q: Array  # (T, 3, 3) its covariance in the frame of that pose, positive definite
-    seen: Array  # (T, M, 2) range [m] and bearing [rad], or direction [rad] of a wall and 0
-    r: Array  # (T, M, 2, 2) its covariance
-    kind: Array  # (T, M) int32 NODE, CORNER or WALL
-    which: Array  # (T, M) int32 landmark 0..L-1 of each feature; L, or -1, for none
+    Attributes:
+        start: (3,) known pose before the first increment, world frame.
+        motion: (T, 3) odometry increments, in the frame of the pose before.
+        q: (T, 3, 3) their covariances in that frame, positive definite.
+        seen: (T, M, 2) measured range [m] and bearing [rad], or direction [rad] of a wall and 0;
+            robot frame.
+        r: (T, M, 2, 2) their covariances.
+        kind: (T, M) int32 NODE, CORNER or WALL.
+        which: (T, M) int32 landmark 0..L-1 of each feature; L, or -1, for none.
+        prior: Of the landmarks; None for none.
+    """
+
+    start: Array
+    motion: Array
+    q: Array
+    seen: Array
+    r: Array
+    kind: Array
+    which: Array
     prior: Prior | None = None
 
 
 class Track(NamedTuple):
-    """A smoothed run."""
+    """Smoothed trajectory and landmarks.
 
-    poses: Array  # (T, 3) world frame
-    places: Array  # (L, 2) [m] world frame, or direction [rad] of a wall and 0
-    cost: Array  # (iterations + 1,) squared Mahalanobis norm of all residuals, the guess first
+    Attributes:
+        poses: (T, 3) world frame.
+        places: (L, 2) [m] world frame, or direction [rad] of a wall and 0.
+        cost: (iterations + 1,) squared Mahalanobis norm of all residuals, the guess's first.
+    """
+
+    poses: Array
+    places: Array
+    cost: Array
 
 
 def records(
@@ -66,36 +94,45 @@ def records(
     prior: Prior | None = None,
     doubt: float = 1.0,
 ) -> Records:
-    """What the filter was given, as the smoother takes it.
+    """The batch problem of a filter's measurements.
 
     Args:
-        noise: What is assumed of it; `FLOOR` is added to the odometry's.
-        start: (3,) known pose before the first motion.
-        inputs: [T] of the filter; `known` is not read.
+        noise: Noise parameters; `FLOOR` is added to the odometry's.
+        start: (3,) known pose before the first increment, world frame.
+        inputs: [T] of the filter; `known` is not used.
         which: (T, M) int32 landmark 0..L-1 of each feature; L, or -1, for none.
         prior: Of the landmarks.
-        doubt: Factor on the standard deviation of features that are not trusted, as `Config.doubt`.
+        doubt: Factor on the standard deviation of untrusted features, as `Config.doubt`.
 
     Raises:
         ValueError: `which` has another shape or type than the features; while tracing.
     """
     expect("which", which, inputs.nodes.kind.shape, jnp.int32)
-    nodes = jax.vmap(restrict)(inputs.nodes, which >= 0)
+    features = jax.vmap(restrict)(inputs.nodes, which >= 0)
     motion, q = jax.vmap(moved, in_axes=(None, 0))(noise, inputs)
     return Records(
         start=start,
         motion=motion,
         q=q + (FLOOR**2 * jnp.eye(3, dtype=q.dtype))[None],
-        seen=jax.vmap(sensor.observation)(nodes),
-        r=jax.vmap(partial(sensor_noise, noise, doubt=doubt))(nodes),
-        kind=nodes.kind,
-        which=jnp.where(nodes.valid, which, -1),
+        seen=jax.vmap(sensor.observation)(features),
+        r=jax.vmap(partial(sensor_noise, noise, doubt=doubt))(features),
+        kind=features.kind,
+        which=jnp.where(features.valid, which, -1),
         prior=prior,
     )
 
 
 def check(records: Records, poses: Array, places: Array) -> None:
-    """Raise ValueError if shapes or types do not fit."""
+    """Raise ValueError if shapes or types do not fit.
+
+    Args:
+        records: The problem.
+        poses: (T, 3).
+        places: (L, 2).
+
+    Raises:
+        ValueError: An array has another shape or type; the message names it.
+    """
     expect("poses", poses, ("T", 3), jnp.floating)
     expect("places", places, ("L", 2), jnp.floating)
     expect("records.which", records.which, (len(poses), "M"), jnp.int32)
@@ -116,27 +153,38 @@ def _root(cov: Array) -> Array:
 
 
 def prepared(records: Records, size: int) -> Records:
-    """Records with a prior, and with roots W of `_root` instead of `r`.
+    """The problem with a prior, and with a root W of the information, W^T W = r^-1, instead of `r`.
 
-    They are zero where a feature has no landmark or holds nonsense.
+    W is zero, which masks the feature, where it has no landmark or its numbers are not finite or
+    not a covariance.
+
+    Args:
+        records: The problem.
+        size: Number L of landmarks.
     """
     seen, r, which = records.seen, records.r, records.which
-    keep = (which >= 0) & (which < size) & jnp.all(jnp.isfinite(seen), axis=-1)
-    keep &= (r[..., 0, 0] > 0.0) & (r[..., 0, 0] * r[..., 1, 1] > r[..., 0, 1] ** 2)
-    keep &= jnp.all(jnp.isfinite(r), axis=(-2, -1))
-    safe = jnp.where(keep[..., None, None], r, jnp.eye(2, dtype=r.dtype))
-    none = Prior(jnp.zeros((size, 2), r.dtype), jnp.zeros((size, 2, 2), r.dtype))
+    usable = (which >= 0) & (which < size) & jnp.all(jnp.isfinite(seen), axis=-1)
+    usable &= (r[..., 0, 0] > 0.0) & (r[..., 0, 0] * r[..., 1, 1] > r[..., 0, 1] ** 2)
+    usable &= jnp.all(jnp.isfinite(r), axis=(-2, -1))
+    safe = jnp.where(usable[..., None, None], r, jnp.eye(2, dtype=r.dtype))
+    no_prior = Prior(jnp.zeros((size, 2), r.dtype), jnp.zeros((size, 2, 2), r.dtype))
     return records._replace(
-        seen=jnp.where(keep[..., None], seen, 0.0),
-        r=jnp.where(keep[..., None, None], jax.vmap(jax.vmap(_root))(safe), 0.0),
-        which=jnp.where(keep, which, 0),
-        prior=records.prior or none,
+        seen=jnp.where(usable[..., None], seen, 0.0),
+        r=jnp.where(usable[..., None, None], jax.vmap(jax.vmap(_root))(safe), 0.0),
+        which=jnp.where(usable, which, 0),
+        prior=records.prior or no_prior,
     )
 
 
 def _residuals(records: Records, state: State) -> tuple[State, Rows]:
-    """Whitened residuals of motions (T, 3) and features (T, M, 2), and their rows."""
-    poses, places = state
+    """Whitened residuals of motions (T, 3) and features (T, M, 2), and their Jacobian.
+
+    For poses x_t = (p_t, heading) and increments u_t, with R_t the rotation by the heading and
+    (x, y) = p_t - p_t-1, an error of the motion to pose t is, to first order,
+
+        d(x_t-1^-1 x_t) = R_t-1^T (dx_t - F dx_t-1)    F = [1 0 -y; 0 1 x; 0 0 1]
+    """
+    poses, landmarks = state
     before = jnp.concatenate([records.start[None], poses[:-1]])
     motion = jax.vmap(between)(before, poses) - records.motion
     motion = motion.at[:, 2].set(wrap_angle(motion[:, 2]))
@@ -144,91 +192,116 @@ def _residuals(records: Records, state: State) -> tuple[State, Rows]:
     eye = jnp.zeros_like(records.q) + jnp.eye(3, dtype=x.dtype)[None]
     turn = eye.at[:, :2, :2].set(jax.vmap(rotation)(before[:, 2]))
     root = jax.vmap(_root)(records.q)
-    each = jax.vmap(jax.vmap(sensor.expect, in_axes=(None, 0, 0)))
-    expected, by_pose, by_place = each(poses, places[records.which], records.kind)
-    seen = -sensor.residual(records.seen, expected, records.kind)
+    predict = jax.vmap(jax.vmap(sensor.expect, in_axes=(None, 0, 0)))
+    predicted, by_pose, by_landmark = predict(poses, landmarks[records.which], records.kind)
+    feature = -sensor.residual(records.seen, predicted, records.kind)
     rows = Rows(
         by_motion=root @ turn.swapaxes(1, 2),
         transition=eye.at[:, :2, 2].set(jnp.stack([-y, x], axis=-1)),
         spread=turn @ records.q @ turn.swapaxes(1, 2),
         by_pose=records.r @ by_pose,
-        by_place=records.r @ by_place,
+        by_place=records.r @ by_landmark,
         at=records.which,
     )
-    return (times(root, motion), times(records.r, seen)), rows
+    return (times(root, motion), times(records.r, feature)), rows
 
 
-def _with_lines(records: Records, places: Array) -> Array:
-    """Wrap the directions of walls that are seen, among `places` (L, 2)."""
+def _wrap_walls(records: Records, landmarks: Array) -> Array:
+    """Landmarks (L, 2), or differences of them, with the directions of observed walls wrapped."""
     wall = jnp.any(records.r != 0.0, axis=(-2, -1)) & (records.kind == WALL)
-    wall = jnp.zeros(places.shape[0], bool).at[records.which].max(wall)
-    return places.at[:, 0].set(jnp.where(wall, wrap_line(places[:, 0]), places[:, 0]))
+    wall = jnp.zeros(landmarks.shape[0], bool).at[records.which].max(wall)
+    return landmarks.at[:, 0].set(jnp.where(wall, wrap_line(landmarks[:, 0]), landmarks[:, 0]))
 
 
 def wrapped(records: Records, state: State) -> State:
-    """A state with its headings and directions of walls in their ranges."""
-    poses, places = state
-    return poses.at[:, 2].set(wrap_angle(poses[:, 2])), _with_lines(records, places)
+    """The state with headings in [-pi, pi) and directions of observed walls in [-pi/2, pi/2).
+
+    Args:
+        records: As `prepared` returns them.
+        state: Poses (T, 3) and landmarks (L, 2).
+    """
+    poses, landmarks = state
+    return poses.at[:, 2].set(wrap_angle(poses[:, 2])), _wrap_walls(records, landmarks)
 
 
 def evaluate(records: Records, state: State) -> tuple[Array, State, Rows, Array]:
-    """Squared Mahalanobis norm () of all residuals, these, their rows, and the prior's pull."""
+    """Linearise the problem at a state.
+
+    Args:
+        records: As `prepared` returns them.
+        state: Poses (T, 3) and landmarks (L, 2).
+
+    Returns:
+        Squared Mahalanobis norm () of all residuals and of the prior's; whitened residuals of
+        motions (T, 3) and features (T, M, 2); their Jacobian; half the gradient (L, 2) of the
+        prior's part.
+    """
     residuals, rows = _residuals(records, state)
-    off = _with_lines(records, state[1] - records.prior.places)
-    pull = times(records.prior.information, off)  # (L, 2) half the gradient of the prior's part
-    return sum(jnp.sum(x**2) for x in residuals) + jnp.sum(off * pull), residuals, rows, pull
+    error = _wrap_walls(records, state[1] - records.prior.places)
+    pull = times(records.prior.information, error)
+    return sum(jnp.sum(x**2) for x in residuals) + jnp.sum(error * pull), residuals, rows, pull
 
 
-def _step(records: Records, state: State) -> tuple[Array, State]:
+def _gauss_newton(records: Records, state: State) -> tuple[Array, State]:
     """Cost () of a state, and the Gauss-Newton step from it."""
     cost, residuals, rows, pull = evaluate(records, state)
-    extra, size = records.prior.information, state[1].shape[0]
-    poses, places = arrow.gradient(rows, residuals, size)
-    # Places of which nothing is known stay; the others are held by no more than rounding takes.
-    known = lax.stop_gradient(jnp.einsum("lii->li", arrow.blocks(rows, size) + extra))
-    held = jnp.where(known > 0.0, 4 * jnp.finfo(known.dtype).eps * known, 1.0)
-    extra += held[..., None] * jnp.eye(2, dtype=held.dtype)[None]
-    return cost, arrow.solve(rows, extra, (-poses, -places - pull))
+    information, size = records.prior.information, state[1].shape[0]
+    poses, landmarks = arrow.gradient(rows, residuals, size)
+    # A unit diagonal keeps unobserved landmarks where they are; all others are damped by no more
+    # than rounding takes.
+    diagonal = jnp.einsum("lii->li", arrow.blocks(rows, size) + information)
+    diagonal = lax.stop_gradient(diagonal)
+    damping = jnp.where(diagonal > 0.0, 4 * jnp.finfo(diagonal.dtype).eps * diagonal, 1.0)
+    information += damping[..., None] * jnp.eye(2, dtype=damping.dtype)[None]
+    return cost, arrow.solve(rows, information, (-poses, -landmarks - pull))
 
 
-def _moved(state: State, step: State, part: Array) -> State:
-    return jax.tree.map(lambda x, dx: x + part * dx, state, step)
+def _moved(state: State, step: State, size: Array) -> State:
+    return jax.tree.map(lambda x, dx: x + size * dx, state, step)
 
 
-def _allowed(records: Records, state: State, step: State, cost: Array) -> Array:
-    """Largest part () of a step that but for rounding does not raise the cost, 0 for none."""
-    most = cost * (1 + 8 * jnp.finfo(cost.dtype).eps)
+def _step_size(records: Records, state: State, step: State, cost: Array) -> Array:
+    """Largest of 1, 1/2, 1/4, ... whose part of a step does not raise the cost; 0 for none.
+
+    A rise within rounding is accepted.
+    """
+    limit = cost * (1 + 8 * jnp.finfo(cost.dtype).eps)
 
     def halve(now: tuple[Array, Array]) -> tuple[Array, Array]:
-        return now[0] / 2, evaluate(records, _moved(state, step, now[0] / 2))[0] <= most
+        size = now[0] / 2
+        return size, evaluate(records, _moved(state, step, size))[0] <= limit
 
-    first = jnp.full((), 2.0, cost.dtype), jnp.zeros((), bool)
-    more = lambda now: ~now[1] & (now[0] > 0.5**HALVINGS)
-    part, fits = lax.while_loop(more, halve, first)
-    return jnp.where(fits, part, 0.0)
+    def unfinished(now: tuple[Array, Array]) -> Array:
+        size, accepted = now
+        return ~accepted & (size > 0.5**HALVINGS)
+
+    start = jnp.full((), 2.0, cost.dtype), jnp.zeros((), bool)
+    size, accepted = lax.while_loop(unfinished, halve, start)
+    return jnp.where(accepted, size, 0.0)
 
 
 @partial(jax.jit, static_argnames="iterations")
 def smooth(records: Records, poses: Array, places: Array, *, iterations: int = 10) -> Track:
-    """Most likely poses and places by Gauss-Newton, from a guess.
+    """Maximum a posteriori poses and landmarks by Gauss-Newton, from a guess.
 
         minimise  sum_t |x_t (-) x_t-1 - u_t|^2_Q + sum_tm |z_tm - h(x_t, l_which)|^2_R + prior
 
-    A step that raises the cost is halved until it does not, so that but for rounding the cost never
-    rises. Features without a landmark, or not finite, are invisible; landmarks without features or
-    prior stay at the guess. Pad a run at its end, by steps that stand still and see nothing.
-    Matches are not doubted. In single precision, what the records hardly tell, such as how a long
-    way without known landmarks bends, stays near the guess.
+    A step that raises the cost is halved until it does not, so the cost never rises, but for
+    rounding. Features without a landmark, or not finite, are ignored; landmarks without features or
+    prior stay at the guess. Pad a trajectory at its end, by zero increments without features.
+    There is no robust kernel: each correspondence counts fully. In single precision, what the
+    measurements hardly constrain, such as the bend of a long path without known landmarks, stays
+    near the guess.
 
     Args:
-        records: What the robot was told. If the start is not certain, `q[0]` covers that too.
+        records: The problem. If the start is uncertain, `q[0]` includes its covariance.
         poses: (T, 3) guess, world frame.
         places: (L, 2) guess.
-        iterations: How many; static.
+        iterations: Number of steps; static.
 
     Returns:
-        The smoothed run; the guess, if the cost of that is not finite. Gradients are those of the
-        iterations as they were run.
+        The smoothed trajectory and landmarks; the guess, if its cost is not finite. Derivatives are
+        those of the iterations that were done.
 
     Raises:
         ValueError: An argument has another shape or type; while tracing.
@@ -236,12 +309,13 @@ def smooth(records: Records, poses: Array, places: Array, *, iterations: int = 1
     check(records, poses, places)
     records = prepared(records, places.shape[0])
 
-    def body(state: State, _: None) -> tuple[State, Array]:
-        cost, step = _step(records, state)
-        part = _allowed(*lax.stop_gradient((records, state, step, cost)))
-        new = _moved(state, step, part)
-        return jax.tree.map(lambda x, y: jnp.where(part > 0.0, x, y), new, state), cost
+    def iterate(state: State, _: None) -> tuple[State, Array]:
+        cost, step = _gauss_newton(records, state)
+        size = _step_size(*lax.stop_gradient((records, state, step, cost)))
+        new = _moved(state, step, size)
+        return jax.tree.map(lambda x, y: jnp.where(size > 0.0, x, y), new, state), cost
 
-    state, costs = lax.scan(body, (poses, places), None, length=iterations)
+    state, costs = lax.scan(iterate, (poses, places), None, length=iterations)
     cost = jnp.append(costs, evaluate(records, state)[0])
-    return Track(*wrapped(records, state), cost)
+    poses, places = wrapped(records, state)
+    return Track(poses, places, cost)

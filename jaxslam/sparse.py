@@ -1,8 +1,24 @@
-"""A long run smoothed: sparse normal equations, factored by SciPy in double precision.
+"""Sparse batch smoother for long recordings: robust Gauss-Newton with a sparse LU factorisation.
 
-`smoother.smooth` is one program that can be batched and differentiated, and is dense in the
-landmarks. This is for one recorded run of kilometres: the work grows with what was seen, and
-matches are doubted, since one that is wrong would bend the whole map.
+`smoother.smooth` is one compiled program that can be batched and differentiated, but it is dense in
+the landmarks and has no robust kernel. This one is for a single recording of kilometres. Its cost
+grows with the number of measurements, it takes loop closures, and all features and loop closures
+have a Cauchy kernel, as one wrong correspondence would bend the whole map.
+
+With e the norm of a whitened residual and c the kernel's scale, the Cauchy kernel is
+
+    rho(e) = c^2 log(1 + e^2 / c^2)        w(e) = rho'(e) / (2 e) = 1 / (1 + e^2 / c^2)
+
+and iteratively reweighted least squares (IRLS) minimises sum rho(e) by
+
+    repeat:
+        scale residuals and their Jacobian by sqrt(w(e))    `_evaluate`, `_weighted_closures`
+        solve (J^T J + prior) step = -gradient              `_normal_matrix`, SciPy's SuperLU
+        halve the step until the cost does not rise
+    until the cost hardly falls
+
+SuperLU runs in its symmetric mode, without pivoting and with a minimum-degree ordering of
+J^T J, which keeps the factors as sparse as those of a Cholesky factorisation.
 
 References:
     Dellaert, Kaess (2006), Square root SAM. Holland, Welsch (1977), Robust regression using
@@ -24,91 +40,121 @@ from jaxslam.closures import Closures
 from jaxslam.smoother import Records, Track
 from jaxslam.types import Array
 
-DOUBT = 3.0  # [std] from which a feature is hardly believed
-SETTLED = 1e-5  # part of the cost: an iteration that takes less of it is the last
-HALVINGS = 8  # of a step that raises the cost; after these it is not taken
-
+DOUBT = 3.0  # [std] scale c of the Cauchy kernel: at this residual the weight is one half
+SETTLED = 1e-5  # fraction of the cost: an iteration that lowers it by less is the last
+HALVINGS = 8  # of a step that raises the cost, at most; after these it is not taken
 
 _prepared = programs.jit(smoother.prepared, static_argnames="size")
 _wrapped = programs.jit(smoother.wrapped)
 
 
 @programs.jit
-def _evaluate(records: Records, state: State, doubt: Array) -> tuple[Array, State, Rows]:
-    """Cost (), its gradient over two, and the rows of the reweighted residuals."""
-    cost, (motion, seen), rows, pull = smoother.evaluate(records, state)
-    square = jnp.sum(seen**2, axis=-1)
-    cost += jnp.sum(doubt**2 * jnp.log1p(square / doubt**2) - square)
-    root = (1.0 / jnp.sqrt(1.0 + square / doubt**2))[..., None]
+def _evaluate(records: Records, state: State, scale: Array) -> tuple[Array, State, Rows]:
+    """Cost (), half its gradient, and the reweighted Jacobian, of all but loop closures."""
+    cost, (motion, feature), rows, pull = smoother.evaluate(records, state)
+    square = jnp.sum(feature**2, axis=-1)
+    cost += jnp.sum(scale**2 * jnp.log1p(square / scale**2) - square)
+    root = (1.0 / jnp.sqrt(1.0 + square / scale**2))[..., None]
     rows = rows._replace(
         by_pose=root[..., None] * rows.by_pose, by_place=root[..., None] * rows.by_place
     )
-    slope = arrow.gradient(rows, (motion, root * seen), state[1].shape[0])
-    return cost, (slope[0], slope[1] + pull), rows
+    gradient = arrow.gradient(rows, (motion, root * feature), state[1].shape[0])
+    return cost, (gradient[0], gradient[1] + pull), rows
 
 
-class _Ties(NamedTuple):
-    """Reweighted residuals of loop closures, as `Rows` are those of features."""
+class _ClosureRows(NamedTuple):
+    """Reweighted residuals of C loop closures, and their Jacobian.
 
-    at: tuple[np.ndarray, np.ndarray]  # (C,) each, of the two poses
-    residual: np.ndarray  # (C, 3)
-    by_pose: tuple[np.ndarray, np.ndarray]  # (C, 3, 3) each
+    Attributes:
+        poses: Indices (C,) of the first pose of each, and (C,) of the second.
+        residual: (C, 3).
+        by_pose: Derivatives (C, 3, 3) with respect to the first pose, and to the second.
+    """
+
+    poses: tuple[np.ndarray, np.ndarray]
+    residual: np.ndarray
+    by_pose: tuple[np.ndarray, np.ndarray]
 
 
-def _doubted(
-    closures: Closures, poses: np.ndarray, slope: np.ndarray, doubt: float
-) -> tuple[float, np.ndarray, _Ties]:
-    """Cost of closures, a gradient over two (T, 3) with theirs added, and their rows."""
+def _weighted_closures(
+    closures: Closures, poses: np.ndarray, gradient: np.ndarray, scale: float
+) -> tuple[float, np.ndarray, _ClosureRows]:
+    """Cost of loop closures, `gradient` (T, 3) with half of theirs added, and their Jacobian."""
     residual, *by_pose = closing.residuals(closures, poses)
     square = np.sum(residual**2, axis=1)
-    root = 1.0 / np.sqrt(1.0 + square / doubt**2)[:, None]
-    ties = _Ties(closures[:2], root * residual, tuple(root[..., None] * by for by in by_pose))
-    slope = np.array(slope)
-    for at, by in zip(ties.at, ties.by_pose, strict=True):
-        np.add.at(slope, at, (by.swapaxes(1, 2) @ ties.residual[..., None])[..., 0])
-    return float(np.sum(doubt**2 * np.log1p(square / doubt**2))), slope, ties
+    root = 1.0 / np.sqrt(1.0 + square / scale**2)[:, None]
+    weighted = tuple(root[..., None] * block for block in by_pose)
+    rows = _ClosureRows((closures.first, closures.second), root * residual, weighted)
+    gradient = np.array(gradient)
+    for index, block in zip(rows.poses, rows.by_pose, strict=True):
+        np.add.at(gradient, index, (block.swapaxes(1, 2) @ rows.residual[..., None])[..., 0])
+    return float(np.sum(scale**2 * np.log1p(square / scale**2))), gradient, rows
 
 
 Blocks = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Blocks (N, n, m), from rows (N,) and columns (N,) on; as arguments: rows, columns, blocks."""
+"""Blocks (N, n, m) of a sparse matrix, after the first row (N,) and first column (N,) of each."""
 
 
 def _assembled(parts: list[Blocks], shape: tuple[int, int]) -> sparse.csc_array:
-    """The matrix that blocks add up to."""
-    found = []
+    """Sparse matrix that is the sum of blocks."""
+    entries = []
     for row, column, blocks in parts:
         down, right = np.indices(blocks.shape[1:])
-        at = row[:, None, None] + down, column[:, None, None] + right
-        found.append([x.ravel() for x in (blocks, *at)])
-    value, row, column = map(np.concatenate, zip(*found, strict=True))
+        rows, columns = row[:, None, None] + down, column[:, None, None] + right
+        entries.append([x.ravel() for x in (blocks, rows, columns)])
+    value, row, column = map(np.concatenate, zip(*entries, strict=True))
     return sparse.csc_array((value, (row, column)), shape=shape)
 
 
-def _matrix(rows: Rows, ties: _Ties | None, extra: np.ndarray) -> sparse.csc_array:
-    """J^T J, and what is known of landmarks (L, 2, 2).
+def _normal_matrix(
+    rows: Rows, closure_rows: _ClosureRows | None, information: np.ndarray
+) -> sparse.csc_array:
+    """J^T J, plus prior information of the landmarks (L, 2, 2), plus a damping of its diagonal.
 
-    Places of which nothing is known stay; all else is held by no more than rounding takes.
+    A unit diagonal keeps unobserved landmarks where they are; all else is damped by no more than
+    rounding takes. The rows of J are, from above, those of motions, features and loop closures; its
+    columns those of poses and landmarks.
     """
-    steps, size = len(rows.at), 3 * len(rows.at) + 2 * len(extra)
-    pose, place = 3 * np.arange(steps), 3 * steps + 2 * np.arange(len(extra))
-    t, m = np.nonzero(np.any(rows.by_place != 0.0, axis=(2, 3)))
+    steps, size = len(rows.at), 3 * len(rows.at) + 2 * len(information)
+    pose, landmark = 3 * np.arange(steps), 3 * steps + 2 * np.arange(len(information))
+    t, m = np.nonzero(np.any(rows.by_place != 0.0, axis=(2, 3)))  # features that are not masked
     feature = 3 * steps + 2 * np.arange(len(t))
     parts = [
         (pose, pose, rows.by_motion),
         (pose[1:], pose[:-1], -(rows.by_motion @ rows.transition)[1:]),
         (feature, pose[t], rows.by_pose[t, m]),
-        (feature, place[rows.at[t, m]], rows.by_place[t, m]),
+        (feature, landmark[rows.at[t, m]], rows.by_place[t, m]),
     ]
     height = 3 * steps + 2 * len(t)
-    if ties is not None:
-        at = height + 3 * np.arange(len(ties.residual))
-        parts += [(at, 3 * k, by) for k, by in zip(ties.at, ties.by_pose, strict=True)]
-        height += ties.residual.size
+    if closure_rows is not None:
+        closure = height + 3 * np.arange(len(closure_rows.residual))
+        for index, block in zip(closure_rows.poses, closure_rows.by_pose, strict=True):
+            parts.append((closure, 3 * index, block))
+        height += closure_rows.residual.size
     jacobian = _assembled(parts, (height, size))
-    matrix = jacobian.T @ jacobian + _assembled([(place, place, extra)], (size, size))
-    known = matrix.diagonal()
-    held = np.where(known > 0.0, 4 * np.finfo(float).eps * known, 1.0)
-    return (matrix + sparse.diags_array(held)).tocsc()
+    matrix = jacobian.T @ jacobian + _assembled([(landmark, landmark, information)], (size, size))
+    diagonal = matrix.diagonal()
+    damping = np.where(diagonal > 0.0, 4 * np.finfo(float).eps * diagonal, 1.0)
+    return (matrix + sparse.diags_array(damping)).tocsc()
+
+
+def _solve(matrix: sparse.csc_array, gradient: State) -> State:
+    """Gauss-Newton step (T, 3) and (L, 2), from the normal matrix and half the gradient."""
+    right = np.concatenate([-np.ravel(x) for x in gradient])
+    factors = splu(
+        matrix,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    step, poses = factors.solve(right), gradient[0].size
+    return step[:poses].reshape(-1, 3), step[poses:].reshape(-1, 2)
+
+
+def _double(x: Array) -> np.ndarray:
+    """A NumPy array, float64 if its numbers are real."""
+    x = np.asarray(x)
+    return x.astype(np.float64, copy=False) if x.dtype.kind == "f" else x
 
 
 def smooth(
@@ -120,63 +166,67 @@ def smooth(
     doubt: float = DOUBT,
     iterations: int = 50,
 ) -> Track:
-    """Most likely poses and places of one run, from a guess, as `smoother.smooth` finds them.
+    """Robust maximum a posteriori poses and landmarks of one trajectory, from a guess.
 
-        minimise  sum_t |x_t (-) x_t-1 - u_t|^2_Q + sum_tm rho(|z_tm - h(x_t, l_which)|_R) + prior
+        minimise  sum_t |x_t (-) x_t-1 - u_t|^2_Q + sum_tm rho(|z_tm - h(x_t, l_which)|_R)
+                  + sum_c rho(|x_first^-1 x_second - motion_c|_information) + prior
 
-    with Cauchy's rho(e) = c^2 log(1 + e^2 / c^2), of closures too, by Gauss-Newton with these
-    weights, which is ended once the cost hardly falls. Runs on the host. To use one program for
-    runs of many lengths, pad them.
+    with the Cauchy kernel rho, by iteratively reweighted Gauss-Newton (see the module's docstring).
+    Runs on the host, in double precision. Compiled programs depend on T, M and L: pad them to share
+    programs between trajectories.
 
     Args:
-        records: What the robot was told; arrays of either precision.
+        records: The problem; arrays of either precision.
         poses: (T, 3) guess, world frame.
         places: (L, 2) guess.
-        closures: Pairs of poses that scans tie to each other; they are doubted as features are.
-        doubt: c [std]; infinite to believe all.
-        iterations: At most.
+        closures: Loop closures between the poses; None for none.
+        doubt: [std] scale c of the kernel; infinite for least squares.
+        iterations: Largest number of steps.
 
     Returns:
-        The smoothed run, NumPy, float64; the guess, if the cost of that is not finite.
+        The smoothed trajectory and landmarks, NumPy, float64; the guess, if its cost is not finite.
+        `cost` has one entry for the guess and one for each step that was taken.
 
     Raises:
         ValueError: An argument has another shape or type, or `doubt` is not positive.
     """
     if not doubt > 0.0:
         raise ValueError(f"doubt is {doubt}, not a positive number of standard deviations")
-    real = lambda x: np.asarray(x, np.float64 if np.asarray(x).dtype.kind == "f" else None)
-    records, state = jax.tree.map(real, (records, (poses, places)))
+    records, state = jax.tree.map(_double, (records, (poses, places)))
     smoother.check(records, *state)
     size = len(state[1])
-    extra = np.zeros((size, 2, 2)) if records.prior is None else records.prior.information
-    limit = np.float64(min(doubt, 1e9))  # from which the logarithm is a square
+    if records.prior is None:
+        information = np.zeros((size, 2, 2))
+    else:
+        information = records.prior.information
+    scale = np.float64(min(doubt, 1e9))  # finite; so large that the kernel is a square
     with jax.enable_x64(True):
-        own = _prepared(records, size)
+        prepared = _prepared(records, size)
 
-        def evaluate(state: State) -> tuple[np.ndarray, State, tuple[Rows, _Ties | None]]:
-            cost, slope, rows = jax.tree.map(np.asarray, _evaluate(own, state, limit))
+        def evaluate(state: State) -> tuple[float, State, tuple[Rows, _ClosureRows | None]]:
+            cost, gradient, rows = jax.tree.map(np.asarray, _evaluate(prepared, state, scale))
             if closures is None:
-                return cost, slope, (rows, None)
-            more, by_pose, ties = _doubted(closures, state[0], slope[0], limit)
-            return cost + more, (by_pose, slope[1]), (rows, ties)
+                return cost, gradient, (rows, None)
+            closure_cost, by_pose, closure_rows = _weighted_closures(
+                closures, state[0], gradient[0], scale
+            )
+            return cost + closure_cost, (by_pose, gradient[1]), (rows, closure_rows)
 
-        cost, slope, rows = evaluate(state)
+        cost, gradient, (rows, closure_rows) = evaluate(state)
         costs = [float(cost)]
         for _ in range(iterations if np.isfinite(cost) else 0):
-            right = np.concatenate([-np.ravel(x) for x in slope])
-            how = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
-            step = splu(_matrix(*rows, extra), diag_pivot_thresh=0.0, **how).solve(right)
-            step = step[: state[0].size].reshape(-1, 3), step[state[0].size :].reshape(-1, 2)
-            for part in 0.5 ** np.arange(HALVINGS + 1):
-                new = tuple(x + part * dx for x, dx in zip(state, step, strict=True))
-                found = evaluate(new)
-                if found[0] <= cost:
+            step = _solve(_normal_matrix(rows, closure_rows, information), gradient)
+            for fraction in 0.5 ** np.arange(HALVINGS + 1):
+                new = tuple(x + fraction * dx for x, dx in zip(state, step, strict=True))
+                new_cost, new_gradient, new_rows = evaluate(new)
+                if new_cost <= cost:
                     break
             else:
                 break
-            fallen, state, (cost, slope, rows) = cost - found[0], new, found
+            decrease = cost - new_cost
+            state, cost, gradient, (rows, closure_rows) = new, new_cost, new_gradient, new_rows
             costs.append(float(cost))
-            if fallen <= SETTLED * cost:
+            if decrease <= SETTLED * cost:
                 break
-        poses, places = jax.tree.map(np.asarray, _wrapped(own, state))
+        poses, places = jax.tree.map(np.asarray, _wrapped(prepared, state))
     return Track(poses, places, np.array(costs))

@@ -1,4 +1,4 @@
-"""The command `jaxslam tune`: noise fitted to simulated drives or to recorded logs."""
+"""The command `jaxslam tune`: noise parameters tuned on simulated runs or on logs."""
 
 import hashlib
 import re
@@ -32,13 +32,44 @@ NOISE, CHECKPOINT = "noise.json", "tune.npz"
 
 
 class Job(NamedTuple):
-    """What is tuned, and on what."""
+    """A tuning task.
+
+    Attributes:
+        config: Configuration of the filter.
+        noise: Initial noise parameters.
+        train: [B] runs to tune on.
+        test: [H] held-out runs to evaluate on; None: evaluate on `train`.
+        title: Title of the summary.
+    """
 
     config: Config
-    noise: Noise  # to start from
-    train: Log  # [B]
-    test: Log | None  # [H]
+    noise: Noise
+    train: Log
+    test: Log | None
     title: str
+
+
+class _Settings(NamedTuple):
+    """Settings of the optimisation, as `fit.tune` takes them."""
+
+    loss: Loss
+    frozen: tuple[str, ...]
+    steps: int
+    batch: int | None
+    seed: int
+    patience: int | None
+
+
+class _LogFiles(NamedTuple):
+    """Logs that are read and checked, but not yet turned into runs."""
+
+    config: Config
+    noise: Noise  # initial
+    train: Sequence[Any]
+    test: Sequence[Any]
+    to_run: Callable[[Any], Log]  # of one of `train` or `test`
+    no_reference: Sequence[Path]  # paths of logs without a reference
+    advice: str  # for them
 
 
 def tune(
@@ -60,36 +91,39 @@ def tune(
     seed: int = 0,
     out: Path = Path("out"),
 ) -> None:
-    """Fit the noise that the filter assumes, on recorded logs or on simulated drives.
+    """Tune the noise parameters of the filter (Q and R) on logs or on simulated runs.
 
-    Writes noise.json, which --noise of the other commands reads, metrics.json with the errors
-    before and after and the standard errors of the parameters, and history.png. When it is
-    stopped, noise.json holds the best so far, and the same command goes on from there.
+    Writes noise.json, which --noise of the other commands reads; metrics.json with the errors
+    before and after, and the standard errors of the parameters; and history.png. When interrupted,
+    noise.json holds the best parameters so far, and the same command resumes the tuning.
 
-    Tuned are the odometry's four coefficients, the sensor's range, bearing, scale and wall, and
-    how far aligned scans are trusted (alignment), by gradient. What decides which feature is which
-    landmark, such as the gate, is not smooth and is not tuned.
+    The parameters are the four coefficients of the odometry noise, range, bearing, scale and wall
+    of the measurement noise, and the factor on the uncertainty of scan matching (alignment). They
+    are optimised by gradient. Parameters of data association, such as the gate, are not
+    differentiable and are not tuned.
 
     Args:
-        logs: Logs of laser scans, as `jaxslam run` takes them, or folders of MRCLAM data sets
-            (FOLDER for all of its robots, FOLDER/Robot2 for one); none: simulated drives.
-        test: Logs to judge by, which nothing is tuned on.
-        reference: A TUM file for each log of scans, first of those to tune on, then of --test;
-            MRCLAM data sets bring their own.
-        odometry: Of logs of scans: scans aligned and fused with the wheels, or the wheels alone.
-        world: Where simulated drives are.
-        runs: Simulated drives to tune on.
-        heldout: And to judge by.
-        loss: What is to be small: calibrated, localisation with a covariance that fits its errors;
-            localisation alone, which leaves the size of the noise open; or the (negative)
-            likelihood of what was observed, the only one that needs no reference.
-        steps: Updates: of L-BFGS, or of Adam with --batch.
-        batch: Drives that each step sees, in turn; by default all.
-        patience: Stop after as many judgements without a better one; by default never.
-        freeze: Parameters that stay: odometry, odometry[0] ... odometry[3], range, bearing, scale,
-            wall, alignment.
-        noise: File of the noise to start from; by default a cautious one.
-        seed: Of the simulated drives and of the order of batches.
+        logs: Laser logs, as `jaxslam run` reads them, or folders of MRCLAM data sets (FOLDER for
+            all of its robots, FOLDER/Robot2 for one); none: simulated runs.
+        test: Held-out logs, for evaluation only.
+        reference: Reference trajectory, a TUM file, of each laser log: first of the logs to tune
+            on, then of --test; MRCLAM data sets contain theirs.
+        odometry: For laser logs: scan matching fused with wheel odometry (scan), or wheel odometry
+            alone (wheels).
+        world: World of the simulated runs.
+        runs: Number of simulated runs to tune on.
+        heldout: Number of simulated held-out runs, for evaluation only.
+        loss: Loss to minimise. calibrated: negative log density of the true pose, which needs both
+            accuracy and a consistent covariance; localisation: pose error alone, which leaves the
+            scale of the noise undetermined; likelihood: negative log-likelihood of the innovations,
+            the only one that needs no reference.
+        steps: Updates of the optimiser: L-BFGS, or Adam with --batch.
+        batch: Runs per update (minibatch); by default all.
+        patience: Stop after this many evaluations without improvement; by default never.
+        freeze: Parameters that are not tuned: odometry, odometry[0] ... odometry[3], range,
+            bearing, scale, wall, alignment.
+        noise: File of the initial noise parameters (Q and R); by default cautious ones.
+        seed: Random seed of the simulation and of the order of the minibatches.
         out: Folder for the results.
     """
     use_cores()
@@ -99,58 +133,56 @@ def tune(
     within("--patience", 1 if patience is None else patience, 1, 10**6)
     if noise is not None and noise.resolve() == (out / NOISE).resolve():
         advice = "name another folder by --out"
-        raise InputError("would be replaced by what is found", path=noise, advice=advice)
-    chosen = losses.BY_NAME[loss]
+        raise InputError("would be replaced by the result", path=noise, advice=advice)
+    settings = _Settings(losses.BY_NAME[loss], freeze, steps, batch, seed, patience)
     with named("--freeze"):
         fit.free(slam.log_noise(aligned=True), freeze)
     if logs:
-        make = _recorded(logs, test, reference, odometry == "scan", noise, chosen)
+        make_job = _recorded(logs, test, reference, odometry == "scan", noise, settings.loss)
     else:
         if test or reference:
-            raise InputError("go with recorded logs", field="--test, --reference")
+            raise InputError("apply to logs only", field="--test, --reference")
         within("--runs", runs, 1, 10**6)
         within("--heldout", heldout, 0, 10**6)
-        make = _simulated(world, runs, heldout, noise, seed)
-    with folder(out) as place:
+        make_job = _simulated(world, runs, heldout, noise, seed)
+    with folder(out) as out_dir:
         keep_compiled()
         with stopwatch() as seconds:
-            job = make()
-            options = {"loss": chosen, "frozen": freeze}
-            how = {"steps": steps, "batch": batch, "seed": seed, "patience": patience}
-            found = _descend(job, out, options, **how)
-            with _stoppable(out, lambda: "all evaluations"):
-                numbers = _judge(job, found, options)
+            job = make_job()
+            found = _tune(job, out, settings)
+            with _resumable(out, lambda: "all evaluations"):
+                numbers = _evaluate(job, found, settings)
         numbers |= {"seconds": seconds}
-        noise_file.write(place / NOISE, found.noise)
-        write_json(place / "metrics.json", numbers)
-        report.draw_history(place / "history.png", found)
+        noise_file.write(out_dir / NOISE, found.noise)
+        write_json(out_dir / "metrics.json", numbers)
+        report.draw_history(out_dir / "history.png", found)
     (out / CHECKPOINT).unlink(missing_ok=True)
     report.tell_tuning(numbers, job.title, out)
 
 
-def _simulated(world: str, runs: int, heldout: int, noise: Path | None, seed: int) -> Any:
-    """What makes the job of simulated drives, after all that was asked for is checked."""
+def _simulated(
+    world: str, runs: int, heldout: int, noise: Path | None, seed: int
+) -> Callable[[], Job]:
+    """Check the options, and return a function that simulates the runs of the job."""
     with named("--world"):
-        known = World(jnp.asarray(worlds.named(world).walls, float))
+        walls = World(jnp.asarray(worlds.named(world).walls, float))
         path = jnp.asarray(plan.densify(worlds.drive(world)), float)
-    start = noise_of(noise, slam.log_noise())
+    initial = noise_of(noise, slam.log_noise())
 
-    def make() -> Job:
+    def make_job() -> Job:
         config, robot = Config(), Robot()
         steps = monte_carlo.drive_steps(robot, path)
         total = runs + heldout
-        print(f"simulating {total} drives of {steps} scans, world {world}", flush=True)
+        print(f"simulating {total} runs of {steps} scans, world {world}", flush=True)
         logs = monte_carlo.simulate(
-            jax.random.key(seed), config, known, robot, path, runs=total, steps=steps
+            jax.random.key(seed), config, walls, robot, path, runs=total, steps=steps
         )
-        train, test = (
-            jax.tree.map(lambda x: np.asarray(x)[part], logs)  # noqa: B023
-            for part in (slice(runs), slice(runs, total))
-        )
-        title = f"{runs} drives in world {world}"
-        return Job(config, start, train, test if heldout else None, title)
+        train = jax.tree.map(lambda leaf: np.asarray(leaf)[:runs], logs)
+        test = jax.tree.map(lambda leaf: np.asarray(leaf)[runs:total], logs)
+        title = f"{runs} simulated runs, world {world}"
+        return Job(config, initial, train, test if heldout else None, title)
 
-    return make
+    return make_job
 
 
 def _recorded(
@@ -160,139 +192,197 @@ def _recorded(
     aligned: bool,
     noise: Path | None,
     loss: Loss,
-) -> Any:
-    """What makes the job of recorded logs, after all files are read and checked."""
-    groups = [[_robots(path) for path in some] for some in (logs, test)]
-    named_ones = {found is not None for some in groups for found in some}
-    if len(named_ones) > 1:
-        raise InputError("logs of scans and MRCLAM data sets are tuned apart", field="LOG")
-    if named_ones == {True}:
+) -> Callable[[], Job]:
+    """Read and check all files, and return a function that turns them into the runs of the job."""
+    robots = {path: _robots(path) for path in (*logs, *test)}
+    is_mrclam = {found is not None for found in robots.values()}
+    if len(is_mrclam) > 1:
+        raise InputError("laser logs and MRCLAM data sets are tuned separately", field="LOG")
+    if is_mrclam == {True}:
         if reference:
-            raise InputError("MRCLAM data sets bring their own", field="--reference")
-        start = noise_of(noise, slam.sighting_noise())
-        robots = [[one for found in some for one in found] for some in groups]
-        parts = [[mrclam.read(*one) for one in some] for some in robots]
-        every = parts[0] + parts[1]
-        config = log_of.config_of(every)
-        read = log_of.from_sightings
-        blind = [
-            folder / f"Robot{robot}"
-            for (folder, robot), one in zip(robots[0] + robots[1], every, strict=True)
-            if not one.referenced.any()
-        ]
-        advice = "use --loss likelihood"
+            raise InputError("MRCLAM data sets contain theirs", field="--reference")
+        files = _read_mrclam(
+            [robot for path in logs for robot in robots[path]],
+            [robot for path in test for robot in robots[path]],
+            noise,
+        )
     else:
-        start = noise_of(noise, slam.log_noise(aligned=aligned))
-        every = [readers.read(path) for path in (*logs, *test)]
-        if reference and len(reference) != len(every):
-            problem = f"{len(reference)} files for {len(every)} logs"
-            raise InputError(problem, field="--reference", advice="give one for each log, in order")
-        known = [tum.read(path) for path in reference] or [None] * len(every)
-        other = [i for i, one in enumerate(every) if one.lidar != every[0].lidar]
-        if other:
-            problem = f"has another scanner than {logs[0]}"
-            raise InputError(problem, path=(*logs, *test)[other[0]], advice="tune them apart")
-        config = log_of.config_of_scans(every)
-        pairs = list(zip(every, known, strict=True))
-        for path, (one, poses) in zip(reference, pairs, strict=False):
-            if not metrics.match_times(one.times, poses[0]).size:
-                advice = "compare their clocks, and the order of --reference"
-                raise InputError("has no pose at the time of a scan", path=path, advice=advice)
-        parts = pairs[: len(logs)], pairs[len(logs) :]
-        read = lambda pair: log_of.from_recording(pair[0], config, pair[1], aligned=aligned)
-        blind = [] if reference else logs
-        advice = "give --reference, or use --loss likelihood"
-    if losses.needs_truth(loss) and blind:
-        problem = f"has no reference, which the loss {loss.__name__} needs"
-        raise InputError(problem, path=blind[0], advice=advice)
+        files = _read_laser_logs(logs, test, reference, aligned, noise)
+    if losses.needs_truth(loss) and files.no_reference:
+        problem = f"has no reference, which the loss {_name(loss)} needs"
+        raise InputError(problem, path=files.no_reference[0], advice=files.advice)
 
-    def make() -> Job:
-        train, tests = ([read(one) for one in some] for some in parts)
-        drives = f"{len(train)} recorded drive{'s' if len(train) > 1 else ''}"
-        title = f"{drives}, {sum(len(one.truth) for one in train)} steps"
-        print(f"{title}; held out: {len(tests)}", flush=True)
-        heldout = log_of.stack(tests) if tests else None
-        return Job(config, start, log_of.stack(train), heldout, title)
+    def make_job() -> Job:
+        train = [files.to_run(log) for log in files.train]
+        held_out = [files.to_run(log) for log in files.test]
+        count = f"{len(train)} log{'s' if len(train) > 1 else ''}"
+        title = f"{count}, {sum(len(run.truth) for run in train)} steps"
+        print(f"{title}; held out: {len(held_out)}", flush=True)
+        held_out = log_of.stack(held_out) if held_out else None
+        return Job(files.config, files.noise, log_of.stack(train), held_out, title)
 
-    return make
+    return make_job
+
+
+def _read_mrclam(
+    train: Sequence[tuple[Path, int]], test: Sequence[tuple[Path, int]], noise: Path | None
+) -> _LogFiles:
+    """Read robots (folder, number) of MRCLAM data sets."""
+    initial = noise_of(noise, slam.sighting_noise())
+    robots = [*train, *test]
+    read = [mrclam.read(path, robot) for path, robot in robots]
+    no_reference = [
+        path / f"Robot{robot}"
+        for (path, robot), log in zip(robots, read, strict=True)
+        if not log.referenced.any()
+    ]
+    return _LogFiles(
+        log_of.config_of(read),
+        initial,
+        read[: len(train)],
+        read[len(train) :],
+        log_of.from_sightings,
+        no_reference,
+        "use --loss likelihood",
+    )
+
+
+def _read_laser_logs(
+    train: Sequence[Path],
+    test: Sequence[Path],
+    reference: Sequence[Path],
+    aligned: bool,
+    noise: Path | None,
+) -> _LogFiles:
+    """Read laser logs of one scanner with their reference trajectories, if there are any."""
+    initial = noise_of(noise, slam.log_noise(aligned=aligned))
+    paths = [*train, *test]
+    read = [readers.read(path) for path in paths]
+    if reference and len(reference) != len(read):
+        problem = f"{len(reference)} files for {len(read)} logs"
+        raise InputError(problem, field="--reference", advice="give one for each log, in order")
+    references = [tum.read(path) for path in reference] or [None] * len(read)
+    for path, log in zip(paths, read, strict=True):
+        if log.lidar != read[0].lidar:
+            problem = f"has another scanner than {paths[0]}"
+            raise InputError(problem, path=path, advice="tune them separately")
+    config = log_of.config_of_scans(read)
+    for path, log, trajectory in zip(reference, read, references, strict=False):
+        if not metrics.match_times(log.times, trajectory[0]).size:
+            advice = "compare their clocks, and the order of --reference"
+            raise InputError("has no pose at the time of a scan", path=path, advice=advice)
+
+    def to_run(pair: tuple[Any, report.Trajectory | None]) -> Log:
+        log, trajectory = pair
+        return log_of.from_recording(log, config, trajectory, aligned=aligned)
+
+    pairs = list(zip(read, references, strict=True))
+    return _LogFiles(
+        config,
+        initial,
+        pairs[: len(train)],
+        pairs[len(train) :],
+        to_run,
+        [] if reference else train,
+        "give --reference, or use --loss likelihood",
+    )
+
+
+def _name(loss: Loss) -> str:
+    """Name of a loss, as --loss takes it."""
+    return next(name for name, function in losses.BY_NAME.items() if function is loss)
 
 
 def _robots(path: Path) -> list[tuple[Path, int]] | None:
-    """Folder and number of the robots of an MRCLAM data set that a path means; None: no such."""
+    """Folder and number of the MRCLAM robots that a path names; None if it is no such data set."""
     if (path / "Barcodes.dat").is_file():
         return [(path, robot) for robot in mrclam.robots(path)]
-    one = re.fullmatch(r"Robot(\d+)(_\w+\.dat)?", path.name)
-    if one and (path.parent / "Barcodes.dat").is_file():
-        return [(path.parent, int(one[1]))]
+    match = re.fullmatch(r"Robot(\d+)(_\w+\.dat)?", path.name)
+    if match and (path.parent / "Barcodes.dat").is_file():
+        return [(path.parent, int(match[1]))]
     return None
 
 
-def _descend(job: Job, out: Path, options: dict[str, Any], **how: int | None) -> fit.Fit:
-    """Tune, from where the last call stopped; keep where it stands after each evaluation."""
+def _tune(job: Job, out: Path, settings: _Settings) -> fit.Fit:
+    """Tune, resuming from a checkpoint in `out`; write one after each evaluation."""
     about = {
         "config": repr(job.config),
-        "loss": options["loss"].__name__,
-        "frozen": sorted(options["frozen"]),
-        **how,
+        "loss": _name(settings.loss),
+        "frozen": sorted(settings.frozen),
+        "steps": settings.steps,
+        "batch": settings.batch,
+        "seed": settings.seed,
+        "patience": settings.patience,
         "noise to start from": job.noise,
         "runs": _hash(job.train),
         "heldout": _hash(job.test),
     }
-    file, state, steps, batch = out / CHECKPOINT, None, how["steps"], how["batch"]
-    whole = batch is None or batch >= len(job.train.motion)
+    file, state, steps = out / CHECKPOINT, None, settings.steps
+    whole = settings.batch is None or settings.batch >= len(job.train.motion)
     if file.exists():
         optimiser = descent.usual(steps, whole=whole)
-        frozen = options["frozen"]
-        begun = fit.begin(job.noise, steps=steps, frozen=frozen, optimiser=optimiser)
-        state = checkpoint.read(file, begun, about)
-        print(f"going on after evaluation {int(state.step)} of {steps + 1}", flush=True)
+        template = fit.begin(job.noise, steps=steps, frozen=settings.frozen, optimiser=optimiser)
+        state = checkpoint.read(file, template, about)
+        print(f"resuming after evaluation {int(state.step)} of {steps + 1}", flush=True)
     done = 0 if state is None else int(state.step)
     bar = tqdm(total=steps + 1, initial=done, desc="compiling", mininterval=0)
 
-    def keep(state: fit.State) -> None:
+    def save(state: fit.State) -> None:
         nonlocal done
         done = int(state.step)
         out.mkdir(parents=True, exist_ok=True)
         noise_file.write(out / NOISE, fit.result(state, job.noise, whole=whole).noise)
         checkpoint.write(file, state, about)
-        judged = state.heldout[np.isfinite(state.heldout)]
-        shown = {"loss": f"{state.loss[done - 1]:.4g}"}
-        shown |= {"heldout": f"{judged[-1]:.4g}"} if judged.size else {}
+        heldout = state.heldout[np.isfinite(state.heldout)]
+        postfix = {"loss": f"{state.loss[done - 1]:.4g}"}
+        postfix |= {"heldout": f"{heldout[-1]:.4g}"} if heldout.size else {}
         bar.set_description("tuning", refresh=False)
-        bar.set_postfix(shown, refresh=False)
+        bar.set_postfix(postfix, refresh=False)
         bar.update(done - bar.n)
 
-    given = {"heldout": job.test, "state": state, "report": keep, **how, **options}
-    with _stoppable(out, lambda: done and f"{done} of {steps + 1} evaluations"), bar:
-        return fit.tune(job.noise, job.config, job.train, **given)
+    with _resumable(out, lambda: done and f"{done} of {steps + 1} evaluations"), bar:
+        return fit.tune(
+            job.noise,
+            job.config,
+            job.train,
+            loss=settings.loss,
+            steps=steps,
+            batch=settings.batch,
+            seed=settings.seed,
+            frozen=settings.frozen,
+            heldout=job.test,
+            patience=settings.patience,
+            state=state,
+            report=save,
+        )
 
 
 @contextmanager
-def _stoppable(out: Path, done: Callable[[], str | int]) -> Iterator[None]:
-    """Say of a Ctrl-C in the block how to go on, if anything is done."""
+def _resumable(out: Path, done: Callable[[], str | int]) -> Iterator[None]:
+    """Let the message of a Ctrl-C in the block say how to resume, if `done` is not 0."""
     try:
         yield
     except KeyboardInterrupt:
         if not done():
             raise
         raise KeyboardInterrupt(
-            f"interrupted after {done()}; {out / NOISE} holds the best so far, and the "
-            "same command goes on from here"
+            f"interrupted after {done()}; {out / NOISE} holds the best parameters so far, and the "
+            "same command resumes"
         ) from None
 
 
-def _judge(job: Job, found: fit.Fit, options: dict[str, Any]) -> report.Numbers:
-    """Numbers of a fit: errors before and after, and how sure it is of its parameters."""
+def _evaluate(job: Job, found: fit.Fit, settings: _Settings) -> report.Numbers:
+    """Errors before and after the tuning, and standard errors of the parameters."""
     runs = job.train if job.test is None else job.test
 
     def errors(noise: Noise) -> report.Numbers:
-        loss = fit.values(noise, job.config, runs, options["loss"])
+        loss = fit.values(noise, job.config, runs, settings.loss)
         numbers = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
         if runs.judged is None or runs.judged.any():
             numbers |= monte_carlo.evaluate(monte_carlo.tracks(job.config, noise, runs))
         return numbers
 
-    print("errors before and after, standard errors of the parameters ...", flush=True)
+    print("evaluating errors before and after, and standard errors ...", flush=True)
     numbers = errors(found.noise) | {
         "judged_on": "the runs it was tuned on" if job.test is None else "held-out runs",
         "before": errors(job.noise) | {"noise": job.noise},
@@ -301,18 +391,20 @@ def _judge(job: Job, found: fit.Fit, options: dict[str, Any]) -> report.Numbers:
         "skipped": int(found.skipped.sum()),
         "noise": found.noise,
         "standard_errors": None,
-        "warnings": ["one drive alone tells no standard errors"],
+        "warnings": ["no standard errors: they need two runs at least"],
     }
     if len(job.train.motion) >= 2:
-        sure = curvature.standard_errors(found.noise, job.config, job.train, **options)
-        relative = dict(zip(sure.names, sure.relative, strict=True))
-        numbers |= {"standard_errors": relative, "warnings": list(sure.warnings)}
+        standard_errors = curvature.standard_errors(
+            found.noise, job.config, job.train, loss=settings.loss, frozen=settings.frozen
+        )
+        relative = dict(zip(standard_errors.names, standard_errors.relative, strict=True))
+        numbers |= {"standard_errors": relative, "warnings": list(standard_errors.warnings)}
     return numbers
 
 
 def _hash(logs: Log | None) -> str:
-    """What tells logs from others."""
-    total = hashlib.sha256()
+    """Hash of the content of logs."""
+    digest = hashlib.sha256()
     for leaf in jax.tree.leaves(logs):
-        total.update(np.ascontiguousarray(leaf).tobytes())
-    return total.hexdigest()[:16]
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:16]

@@ -1,6 +1,6 @@
-"""A run as it goes on, for rerun's viewer: live, or kept in a file for it.
+"""Live view of a run in the rerun viewer, or a rerun file (.rrd) of it.
 
-The only part of the library that imports rerun.
+The only module of the library that imports rerun.
 """
 
 from collections.abc import Sequence
@@ -22,104 +22,120 @@ from jaxslam.slam import Config
 
 
 class View:
-    """What has been shown of a run; `watch` is for `online.survey`."""
+    """A rerun recording of a run; `watch` is a callback for `online.survey`."""
 
     def __init__(self, config: Config, times: np.ndarray, scans: Scan, file: Path | None):
-        """Open the viewer, or a file for it.
+        """Open the viewer, or a file.
 
         Args:
-            config: Of the filter.
+            config: Configuration of the filter.
             times: (T,) [s] of the scans.
-            scans: [T].
-            file: To write; None: the viewer is opened.
+            scans: [T] laser scans.
+            file: File to write; None: open the viewer.
 
         Raises:
             InputError: rerun is not installed.
         """
         if find_spec("rerun") is None:
             advice = "pip install 'jaxslam[view]'"
-            raise InputError("rerun is needed to show a run as it goes on", advice=advice)
-        import rerun  # takes its time to load
+            raise InputError("rerun is needed for the live view of a run", advice=advice)
+        import rerun  # imported here, because it is slow to import
 
         self._config, self._times, self._hit = config, times, np.asarray(scans.hit)
-        self._ends = np.asarray(jax.vmap(lidar.points, in_axes=(0, None))(scans, config.lidar))
+        self._points = np.asarray(jax.vmap(lidar.points, in_axes=(0, None))(scans, config.lidar))
         self._poses = np.zeros((0, 3))
         self._stream = rerun.RecordingStream("jaxslam")
         if file is None:
             self._stream.spawn()
         else:
             self._stream.save(file)
-        # The viewer draws y of flat pictures downwards.
+        # The viewer draws y downwards in 2-D views, hence the 3-D coordinates.
         self._log("", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def watch(self, mapper: Mapper, part: Part) -> None:
-        """Show the scans of a stretch where they were made, and the landmarks after them."""
+        """Show the scans of a chunk at their estimated poses, and the landmarks after the chunk.
+
+        Args:
+            mapper: State of the filter after the chunk.
+            part: Results of the chunk.
+        """
         from rerun import Arrows3D, Points3D
 
         from jaxslam.plot.sheet import BLUE, ORANGE
 
         for pose in np.asarray(part.info.pose, np.float64):
-            at = len(self._poses)
+            scan = len(self._poses)
             self._poses = np.concatenate([self._poses, pose[None]])
-            self._stream.set_time("scan", sequence=at)
-            self._stream.set_time("time", duration=float(self._times[at] - self._times[0]))
+            self._stream.set_time("scan", sequence=scan)
+            self._stream.set_time("time", duration=float(self._times[scan] - self._times[0]))
             if not np.isfinite(pose).all():
                 continue
-            ahead = 0.8 * np.array([[np.cos(pose[2]), np.sin(pose[2])]])
-            self._log(
-                "robot",
-                Arrows3D(vectors=_flat(ahead), origins=_flat(pose[None, :2]), colors=_rgb(BLUE)),
+            direction = 0.8 * np.array([[np.cos(pose[2]), np.sin(pose[2])]])
+            arrow = Arrows3D(
+                vectors=_to_3d(direction), origins=_to_3d(pose[None, :2]), colors=_rgb(BLUE)
             )
-            seen = _flat(placed(pose, self._ends[at][self._hit[at]]))
-            self._log("scan", Points3D(seen, colors=_rgb(ORANGE), radii=0.03))
-        self._lines("path", [self._poses[:, :2]], BLUE, 0.03)
-        self._landmarks(mapper.belief)
+            self._log("robot", arrow)
+            points = _to_3d(placed(pose, self._points[scan][self._hit[scan]]))
+            self._log("scan", Points3D(points, colors=_rgb(ORANGE), radii=0.03))
+        self._log_polylines("path", [self._poses[:, :2]], BLUE, 0.03)
+        self._log_landmarks(mapper.belief)
 
     def end(self, survey: Survey) -> None:
-        """Show all as it is known at the end, and the arcs of the topological map."""
+        """Show the final trajectory, landmarks and arcs of the topological map.
+
+        Args:
+            survey: Result of SLAM.
+        """
         from jaxslam.plot.sheet import BLUE, GREEN
 
-        self._lines("path", [survey.poses[:, :2]], BLUE, 0.03)
-        self._landmarks(survey.belief)
-        self._lines("map/arcs", survey.graph.lines, GREEN, 0.02)
+        self._log_polylines("path", [survey.poses[:, :2]], BLUE, 0.03)
+        self._log_landmarks(survey.belief)
+        self._log_polylines("map/arcs", survey.graph.lines, GREEN, 0.02)
         self._stream.disconnect()
 
-    def _lines(self, name: str, lines: Sequence[np.ndarray], colour: str, radius: float) -> None:
+    def _log_polylines(
+        self, name: str, lines: Sequence[np.ndarray], colour: str, radius: float
+    ) -> None:
         from rerun import LineStrips3D
 
-        flat = [_flat(line) for line in lines]
-        self._log(name, LineStrips3D(flat, colors=_rgb(colour), radii=radius))
+        strips = [_to_3d(line) for line in lines]
+        self._log(name, LineStrips3D(strips, colors=_rgb(colour), radii=radius))
 
-    def _landmarks(self, belief: Belief) -> None:
+    def _log_landmarks(self, belief: Belief) -> None:
+        """Log the confirmed junctions and corners with their 3-sigma ellipses."""
         from rerun import LineStrips3D, Points3D
 
         from jaxslam.plot.places import MARKS
         from jaxslam.plot.sheet import SIGMAS
 
-        counts = np.asarray(slam.confirmed(self._config, belief))
-        place, own = np.asarray(belief.places, np.float64), np.asarray(blocks_of(belief.map_cov))
+        confirmed = np.asarray(slam.confirmed(self._config, belief))
+        position = np.asarray(belief.places, np.float64)
+        cov = np.asarray(blocks_of(belief.map_cov))
         angle = np.linspace(-np.pi, np.pi, 25)
         circle = SIGMAS * np.stack([np.cos(angle), np.sin(angle)])
         for kind, (_, colour, name) in MARKS.items():
-            use = counts & (np.asarray(belief.kind) == kind)
-            values, vectors = np.linalg.eigh(own[use].astype(np.float64))
-            stretched = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-            rings = place[use][:, None] + np.swapaxes(stretched @ circle, 1, 2)
-            labels = [f"{name} {id}" for id in np.asarray(belief.id)[use]]
-            look = {"colors": _rgb(colour)}
-            dots = Points3D(_flat(place[use]), labels=labels, show_labels=False, radii=0.1, **look)
-            self._log(f"map/{name}s", dots)
-            self._log(f"map/{name}s/ellipses", LineStrips3D(list(_flat(rings)), radii=0.01, **look))
+            use = confirmed & (np.asarray(belief.kind) == kind)
+            values, vectors = np.linalg.eigh(cov[use].astype(np.float64))
+            root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+            rings = position[use][:, None] + np.swapaxes(root @ circle, 1, 2)
+            labels = [f"{name} {number}" for number in np.asarray(belief.id)[use]]
+            rgb = _rgb(colour)
+            points = Points3D(
+                _to_3d(position[use]), labels=labels, show_labels=False, radii=0.1, colors=rgb
+            )
+            self._log(f"map/{name}s", points)
+            strips = LineStrips3D(list(_to_3d(rings)), radii=0.01, colors=rgb)
+            self._log(f"map/{name}s/ellipses", strips)
 
-    def _log(self, name: str, what: Any, **how: bool) -> None:
-        self._stream.log(f"world/{name}".rstrip("/"), what, **how)
+    def _log(self, name: str, entity: Any, *, static: bool = False) -> None:
+        self._stream.log(f"world/{name}".rstrip("/"), entity, static=static)
 
 
-def _flat(xy: np.ndarray) -> np.ndarray:
-    """Points (..., 3) of points (..., 2), on the floor."""
+def _to_3d(xy: np.ndarray) -> np.ndarray:
+    """Points (..., 3) with z = 0 of points (..., 2)."""
     return np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
 
 
 def _rgb(colour: str) -> list[int]:
-    """Numbers of a colour `#RRGGBB`."""
-    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    """Red, green, blue 0..255 of a colour `#RRGGBB`."""
+    return [int(colour[start : start + 2], 16) for start in (1, 3, 5)]

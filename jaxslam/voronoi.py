@@ -1,12 +1,39 @@
-"""The cellular automaton that grows a Voronoi diagram (paper, sections 2.1 and 2.3).
+"""Cellular automaton that grows a Voronoi diagram on a grid (paper, sections 2.1 and 2.3).
 
-A cell holds a *set* of labels as bits: none, one (it belongs to a region), or several (fronts met
-in it: it lies on a branch). One rule does everything: an empty open cell takes the union of its
-four neighbours that hold exactly one label. A cell that holds a label keeps it, and a branch
-cell passes nothing on, which makes the diagonal bisector of the Manhattan distance one cell thin.
+Rule. A cell holds a set of labels, as bits: none (empty), one (it belongs to the region of that
+label), or several (fronts met in it: it is a branch cell). All cells change at once, step by step:
+
+    for each cell that is open and empty:
+        arrived = the labels of those of its four neighbours that hold exactly one label
+        the cell holds the union of arrived
+
+A cell that holds a label keeps it, and a branch cell passes nothing on: diagonal bisectors of the
+Manhattan distance are one cell thin.
+
+Encoding. `grow` follows this rule with one signed byte per cell:
+
+    int8          the same bits as uint8    meaning
+    0 .. 126      0 .. 126                  number of the only label that the cell holds
+    EMPTY = -1    255                       open, not reached yet
+    -128 .. -2    128 .. 254                shut: it never changes and passes nothing on
+                                            SHUT = -128: closed, or a source of several labels
+                                            n - 128: fronts met, n is the largest label of them
+
+Let `largest` be the maximum of the neighbours as int8, `smallest` their minimum as uint8. In the
+first order each label is above whatever holds none, in the second it is below. Hence
+
+    neighbours that hold a label    largest, smallest    value of an empty cell
+    one label n                     both n               n
+    labels a < ... < b              b and a, so a < b    b with the sign bit set: shut
+    none, one is EMPTY              -1                   EMPTY
+    none, all are shut              -128 .. -2           shut: nothing can ever reach it
+
+SHUT is the sign bit alone, so all of this is `largest | (SHUT if smallest < largest else 0)`:
+where `largest` is negative its sign bit is set anyhow. The sets of labels of the cells in which
+fronts met are recovered from their neighbours when growth has ended (`gather`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial, reduce
 from typing import NamedTuple
 
@@ -20,10 +47,15 @@ from jaxslam.types import Array, expect
 
 
 class Diagram(NamedTuple):
-    """Which fronts reached each cell, and when."""
+    """Voronoi diagram on a grid: which fronts reached each cell, and when.
 
-    labels: Array  # (H, W) bit set, 0 where nothing arrived
-    arrival: Array  # (H, W) int32 step of arrival: 0 at sources, -1 where nothing arrived
+    Attributes:
+        labels: (H, W) unsigned bit set of labels, 0 where no front arrived.
+        arrival: (H, W) int32 step of arrival: 0 at sources, -1 where no front arrived.
+    """
+
+    labels: Array
+    arrival: Array
 
 
 def single(labels: Array) -> Array:
@@ -33,98 +65,128 @@ def single(labels: Array) -> Array:
 
 def around(cells: Array) -> tuple[Array, Array, Array, Array]:
     """The four neighbours (H, W) of every cell: next and previous row, next and previous column."""
-    return _beside(jnp.pad(cells, 1))
+    return _four_neighbours(jnp.pad(cells, 1))
 
 
-def _beside(cells: Array) -> tuple[Array, Array, Array, Array]:
+def _four_neighbours(cells: Array) -> tuple[Array, Array, Array, Array]:
     """`around` of the inner cells (H, W) of (H + 2, W + 2)."""
     return cells[2:, 1:-1], cells[:-2, 1:-1], cells[1:-1, 2:], cells[1:-1, :-2]
 
 
-def _across(cells: Array) -> tuple[Array, Array, Array, Array]:
+def _diagonal_neighbours(cells: Array) -> tuple[Array, Array, Array, Array]:
     """The four diagonal neighbours of the inner cells (H, W) of (H + 2, W + 2)."""
     return cells[2:, 2:], cells[:-2, 2:], cells[2:, :-2], cells[:-2, :-2]
 
 
 def block_union(labels: Array) -> Array:
     """Union (H, W) of the bit sets in the 3 x 3 block around every cell."""
-    p = jnp.pad(labels, 1)
-    rows = p[:-2] | p[1:-1] | p[2:]
+    padded = jnp.pad(labels, 1)
+    rows = padded[:-2] | padded[1:-1] | padded[2:]
     return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
 
 
 EMPTY, SHUT = -1, -128
-"""Values of cells while fronts move: not reached yet, and never to be; see `_fronts`."""
+"""Values of cells that hold no label: not reached yet, and never to be reached."""
 
-PACE = 8  # steps from one look whether anything still moves to the next
-
-
-def _next(now: Array, other: Array, *, diagonal: bool, more: bool) -> Array:
-    """Cells (H + 2, W + 2) after one step; the ring around them is kept from `other`.
-
-    A front's number is that of its label, and all else is negative. So the largest neighbour, and
-    the smallest as unsigned numbers, are the same unless fronts of several labels meet, or none
-    is there; what met gets the sign bit, and passes nothing on. An empty cell that has only shut
-    ones around it becomes one of them: it can never be reached, unless `more` neighbours count in
-    another step.
-    """
-    bits = lambda cells: (lax.bitcast_convert_type(x, jnp.uint8) for x in cells)
-    beside, across = _beside(now), _across(now) if diagonal else ()
-    most, least = reduce(jnp.maximum, beside), reduce(jnp.minimum, bits(beside))
-    if diagonal:
-        nearer = most >= 0
-        most = jnp.where(nearer, most, reduce(jnp.maximum, across, most))
-        least = jnp.where(nearer, least, reduce(jnp.minimum, bits(across), least))
-    if more:
-        most = jnp.maximum(most, jnp.int8(EMPTY))
-    differ = lax.bitcast_convert_type(least, jnp.int8) - most  # negative where fronts meet
-    reached = most | (differ & jnp.int8(SHUT))
-    inner = now[1:-1, 1:-1]
-    inner = jnp.where(inner == EMPTY, reached, inner)
-    # Written to the state before `now`, which nobody needs any more, so that nothing is copied.
-    return lax.dynamic_update_slice(other, inner, (1, 1))
+PACE = 8  # steps between two checks whether any cell still changes
 
 
-def _fronts(start: Array, steps: int, octagon: bool) -> tuple[Array, Array]:
-    """Move the fronts of one grid (H + 2, W + 2) int8, ringed by shut cells, until nothing moves.
+def _as_unsigned(cells: tuple[Array, ...]) -> Iterator[Array]:
+    """The bits of int8 arrays as uint8: what holds no label is above all labels."""
+    return (lax.bitcast_convert_type(x, jnp.uint8) for x in cells)
+
+
+def _step(cells: Array, buffer: Array, *, diagonal: bool, diagonal_next: bool) -> Array:
+    """One step of the automaton, in the encoding of the module's docstring.
+
+    Args:
+        cells: (H + 2, W + 2) int8, ringed by shut cells.
+        buffer: An earlier state, of which the ring is kept and the rest overwritten, not copied.
+        diagonal: Where none of the four neighbours holds a label, the diagonal ones count.
+        diagonal_next: They count in the next step: a cell between four shut ones stays empty.
 
     Returns:
-        The cells: the number of the label that holds it alone, `EMPTY`, or what is shut: closed
-        cells and those in which fronts met. And the number of states from 0 on in which each cell
-        was empty, which is the step of its arrival.
+        The cells (H + 2, W + 2) after the step.
     """
-    small = np.min_scalar_type(steps + 1)
-    first = partial(_next, diagonal=False, more=octagon)
-    second = partial(_next, diagonal=octagon, more=False)
-    empty = lambda cells: (cells == EMPTY).astype(small)
+    sides = _four_neighbours(cells)
+    corners = _diagonal_neighbours(cells) if diagonal else ()
+    largest, smallest = reduce(jnp.maximum, sides), reduce(jnp.minimum, _as_unsigned(sides))
+    if diagonal:
+        from_side = largest >= 0
+        largest = jnp.where(from_side, largest, reduce(jnp.maximum, corners, largest))
+        with_corners = reduce(jnp.minimum, _as_unsigned(corners), smallest)
+        smallest = jnp.where(from_side, smallest, with_corners)
+    if diagonal_next:
+        largest = jnp.maximum(largest, jnp.int8(EMPTY))
+    # The sign bit is set where labels differ. No overflow: both are labels, or both are negative.
+    difference = lax.bitcast_convert_type(smallest, jnp.int8) - largest
+    reached = largest | (difference & jnp.int8(SHUT))
+    inner = cells[1:-1, 1:-1]
+    inner = jnp.where(inner == EMPTY, reached, inner)
+    return lax.dynamic_update_slice(buffer, inner, (1, 1))
 
-    def two(now: tuple[Array, Array, Array], _: None):
-        even, odd, waited = now
-        odd = first(even, odd)
-        even = second(odd, even)
-        return (even, odd, waited + (empty(odd) + empty(even))), None
 
-    def some(now: tuple[Array, Array, tuple[Array, Array, Array]]):
-        done, _, cells = now
-        cells, _ = lax.scan(two, cells, length=PACE // 2)
-        return done + PACE, jnp.max((cells[0] ^ cells[1]).view(jnp.uint8)) > 0, cells
+def _grow_padded(start: Array, steps: int, octagon: bool) -> tuple[Array, Array]:
+    """Apply `_step` to one grid, `steps` times or until nothing changes any more.
 
-    whole = steps // PACE * PACE
-    go_on = lambda now: (now[0] < whole) & now[1]
-    begin = (jnp.int32(0), jnp.bool_(True), (start, start, empty(start)))
-    now = lax.while_loop(go_on, some, begin)[2]
-    (even, odd, waited), _ = lax.scan(two, now, length=(steps - whole) // 2)
+    Steps go in pairs, odd and even: the two states are each other's buffers, and of an octagon
+    the odd step enters the four neighbours, the even one the diagonal ones too:
+
+                     . . . . .         . 2 2 2 .
+        step 1:      . . 1 . .   2:    2 2 1 2 2
+                     . 1 0 1 .         2 1 0 1 2
+                     . . 1 . .         2 2 1 2 2
+                     . . . . .         . 2 2 2 .
+
+    After n steps a front from the origin has |x|, |y| <= n and |x| + |y| <= n + n // 2.
+
+    Args:
+        start: (H + 2, W + 2) int8, ringed by shut cells.
+        steps: The most steps.
+        octagon: As of `expand`.
+
+    Returns:
+        The cells at the end, and in how many states from 0 on each was empty: its step of arrival.
+    """
+    counter = np.min_scalar_type(steps + 1)
+    odd_step = partial(_step, diagonal=False, diagonal_next=octagon)
+    even_step = partial(_step, diagonal=octagon, diagonal_next=False)
+
+    def is_empty(cells: Array) -> Array:
+        return (cells == EMPTY).astype(counter)
+
+    def two_steps(state: tuple[Array, Array, Array], _: None):
+        even, odd, waited = state
+        odd = odd_step(even, odd)
+        even = even_step(odd, even)
+        return (even, odd, waited + (is_empty(odd) + is_empty(even))), None
+
+    def until_check(carry: tuple[Array, Array, tuple[Array, Array, Array]]):
+        done, _, state = carry
+        state, _ = lax.scan(two_steps, state, length=PACE // 2)
+        changes = jnp.max((state[0] ^ state[1]).view(jnp.uint8)) > 0
+        return done + PACE, changes, state
+
+    checked = steps // PACE * PACE
+    first = (jnp.int32(0), jnp.bool_(True), (start, start, is_empty(start)))
+    state = lax.while_loop(lambda carry: (carry[0] < checked) & carry[1], until_check, first)[2]
+    (even, odd, waited), _ = lax.scan(two_steps, state, length=(steps - checked) // 2)
     if steps % 2:
-        even = first(even, odd)
-        waited = waited + empty(even)
+        even = odd_step(even, odd)
+        waited = waited + is_empty(even)
     return even, waited
 
 
 class Fronts(NamedTuple):
-    """How far fronts of sources with one label each have come."""
+    """Result of `grow`: the cells in the encoding of the module's docstring.
 
-    cells: Array  # (H, W) int8 number of the label that holds a cell alone, EMPTY, or less: shut
-    waited: Array  # (H, W) unsigned, states from 0 on in which it was empty: step of arrival
+    Attributes:
+        cells: (H, W) int8 number of the only label that a cell holds, EMPTY, or shut (below EMPTY).
+        waited: (H, W) unsigned, in how many states from 0 on it was empty: its step of arrival.
+    """
+
+    cells: Array
+    waited: Array
 
 
 def number(labels: Array, open: Array) -> Array:
@@ -139,17 +201,17 @@ def number(labels: Array, open: Array) -> Array:
     """
     expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
     expect("open", open, labels.shape, jnp.bool_)
-    own = lax.population_count(labels - 1).astype(jnp.int8)
+    own = lax.population_count(labels - 1).astype(jnp.int8)  # of 1 << n: n
     own = jnp.where((labels != 0) & (labels & (labels - 1) == 0), own, SHUT)
     return jnp.where((labels == 0) & open, EMPTY, own).astype(jnp.int8)
 
 
 def grow(start: Array, *, steps: int, octagon: bool = False) -> Fronts:
-    """Expand all sources together, as numbers of one byte a cell: `expand` without the sets.
+    """Expand all sources together, in the encoding of one byte per cell.
 
     Args:
         start: (H, W) int8 as of `number`.
-        steps: Number of steps; a front advances one cell a step.
+        steps: Number of steps; a front advances one cell per step.
         octagon: As of `expand`.
 
     Raises:
@@ -158,13 +220,16 @@ def grow(start: Array, *, steps: int, octagon: bool = False) -> Fronts:
     expect("start", start, ("H", "W"), jnp.int8)
     if steps < 0:
         raise ValueError(f"steps is {steps}, not 0 or more")
-    fronts = one_by_one(partial(_fronts, steps=steps, octagon=octagon))
-    cells, waited = fronts(jnp.pad(start, 1, constant_values=SHUT))
+    grow_padded = one_by_one(partial(_grow_padded, steps=steps, octagon=octagon))
+    cells, waited = grow_padded(jnp.pad(start, 1, constant_values=SHUT))
     return Fronts(cells[1:-1, 1:-1], waited[1:-1, 1:-1])
 
 
 def gather(labels: Array, fronts: Fronts, *, octagon: bool = False) -> Diagram:
-    """The sets of all cells: that of one in which fronts met is known from those around it.
+    """Recover the sets of labels of all cells from the numbers of single labels.
+
+    A cell holds the labels that its neighbours held before its step of arrival; of octagons, where
+    none of the four did and that step is even, those of its diagonal neighbours.
 
     Args:
         labels: (H, W) unsigned bit sets of the sources.
@@ -177,19 +242,20 @@ def gather(labels: Array, fronts: Fronts, *, octagon: bool = False) -> Diagram:
     expect("labels", labels, ("H", "W"), jnp.unsignedinteger)
     expect("fronts.cells", fronts.cells, labels.shape, jnp.int8)
     cells = jnp.pad(fronts.cells, 1, constant_values=SHUT)
-    waited, own = jnp.pad(fronts.waited, 1), fronts.waited
+    waited, arrival = jnp.pad(fronts.waited, 1), fronts.waited
     one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
     bits = jnp.where(cells >= 0, one << jnp.maximum(cells, 0).astype(labels.dtype), none)
 
-    def came(around: Callable[[Array], tuple[Array, Array, Array, Array]]) -> Array:
-        near = zip(around(bits), around(waited), strict=True)
-        return reduce(jnp.bitwise_or, (jnp.where(when < own, bit, none) for bit, when in near))
+    def arrived(neighbours: Callable[[Array], tuple[Array, Array, Array, Array]]) -> Array:
+        pairs = zip(neighbours(bits), neighbours(waited), strict=True)
+        return reduce(jnp.bitwise_or, (jnp.where(when < arrival, bit, none) for bit, when in pairs))
 
-    union = came(_beside)
+    union = arrived(_four_neighbours)
     if octagon:
-        union |= jnp.where((union == 0) & (own % 2 == 0), came(_across), none)
+        from_corners = (union == 0) & (arrival % 2 == 0)
+        union |= jnp.where(from_corners, arrived(_diagonal_neighbours), none)
     union = jnp.where(fronts.cells == EMPTY, none, union | labels)
-    return Diagram(labels=union, arrival=jnp.where(union != 0, own.astype(jnp.int32), -1))
+    return Diagram(labels=union, arrival=jnp.where(union != 0, arrival.astype(jnp.int32), -1))
 
 
 @partial(jax.jit, static_argnames=("steps", "octagon"))
@@ -197,12 +263,11 @@ def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> 
     """Expand all sources together for a fixed number of steps.
 
     Args:
-        labels: (H, W) unsigned bit sets: 8 labels in uint8, 16 in uint16, 32 in uint32; non-zero
-            cells are the sources.
+        labels: (H, W) unsigned bit sets, as many labels as bits; non-zero cells are the sources.
         open: (H, W) bool, the cells that fronts may enter.
-        steps: Number of steps; a front advances one cell a step.
+        steps: Number of steps; a front advances one cell per step.
         octagon: Every second step enters the four diagonal neighbours too, where no front comes
-            from nearer. Fronts then grow as octagons, which are nearer to circles than the paper's
+            from a side. Fronts then grow as octagons, which are nearer to circles than the paper's
             diamonds.
 
     Raises:
@@ -216,9 +281,9 @@ def expand(labels: Array, open: Array, *, steps: int, octagon: bool = False) -> 
 
 
 def crowded(fronts: Fronts, sources: Array) -> Array:
-    """Cells (H, W) bool whose 3 x 3 block, sources left out, holds three or more numbers.
+    """Cells (H, W) bool whose 3 x 3 block, sources left out, holds three or more single labels.
 
-    `junctions` without the sets of the cells in which fronts met.
+    As `junctions`; a third label is one strictly between the smallest and the largest.
 
     Args:
         fronts: Result of `grow`.
@@ -230,18 +295,17 @@ def crowded(fronts: Fronts, sources: Array) -> Array:
     expect("fronts.cells", fronts.cells, ("H", "W"), jnp.int8)
     expect("sources", sources, fronts.cells.shape, jnp.bool_)
     own = jnp.where(sources, jnp.int8(SHUT), fronts.cells)
-    p = jnp.pad(own, 1, constant_values=SHUT)
-    block = (own, *_beside(p), *_across(p))
-    most = reduce(jnp.maximum, block)
-    # As unsigned numbers, what holds no label is larger than what does.
-    least = reduce(jnp.minimum, (lax.bitcast_convert_type(x, jnp.uint8) for x in block))
-    least = lax.bitcast_convert_type(least, jnp.int8)
-    between = reduce(jnp.logical_or, ((x > least) & (x < most) for x in block))
-    return between & (least >= 0) & (fronts.cells != EMPTY) & ~sources
+    padded = jnp.pad(own, 1, constant_values=SHUT)
+    block = (own, *_four_neighbours(padded), *_diagonal_neighbours(padded))
+    largest = reduce(jnp.maximum, block)
+    smallest = reduce(jnp.minimum, _as_unsigned(block))
+    smallest = lax.bitcast_convert_type(smallest, jnp.int8)  # negative where no label is
+    between = reduce(jnp.logical_or, ((x > smallest) & (x < largest) for x in block))
+    return between & (smallest >= 0) & (fronts.cells != EMPTY) & ~sources
 
 
 def _expect_cells(diagram: Diagram, sources: Array) -> None:
-    """Raise ValueError unless a diagram and its sources fit."""
+    """Raise ValueError unless a diagram and its sources have the same cells."""
     expect("diagram.labels", diagram.labels, ("H", "W"), jnp.unsignedinteger)
     expect("sources", sources, diagram.labels.shape, jnp.bool_)
 
@@ -249,9 +313,9 @@ def _expect_cells(diagram: Diagram, sources: Array) -> None:
 def branches(diagram: Diagram, sources: Array) -> Array:
     """Cells (H, W) bool of the Voronoi branches.
 
-    A cell in which fronts met is a branch. Where two fronts meet between two cells, no cell holds
-    both labels: then the cell with the smaller label is the branch, so that the branch stays
-    one cell thick and no two regions are left unseparated.
+    A cell in which fronts met is a branch cell. Where two fronts meet between two cells, no cell
+    holds both labels: then the cell with the smaller label is the branch, which stays one cell
+    thick, and no two regions touch.
 
     Args:
         diagram: Result of `expand`.

@@ -1,4 +1,4 @@
-"""The environments of the paper's figures, and an office to drive through."""
+"""Simulated environments: those of the paper's figures, an office, and random floor plans."""
 
 from typing import NamedTuple
 
@@ -12,13 +12,17 @@ Box = tuple[float, float, float, float]
 
 
 class World(NamedTuple):
-    """What the lidar sees: straight walls without thickness."""
+    """An environment of straight walls without thickness.
 
-    walls: Array  # (S, 4) ends x1 y1 x2 y2 [m]
+    Attributes:
+        walls: (S, 4) [m] ends x1, y1, x2, y2, world frame.
+    """
+
+    walls: Array
 
 
 def covers(boxes: list[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether each point (x, y) of a grid lies in one of the boxes: (len(x), len(y)) bool."""
+    """Whether each point (x, y) of a grid is in one of the boxes: (len(x), len(y)) bool."""
     inside = np.zeros((len(x), len(y)), bool)
     for x0, y0, x1, y1 in boxes:
         inside |= ((x0 < x) & (x < x1))[:, None] & ((y0 < y) & (y < y1))
@@ -26,42 +30,40 @@ def covers(boxes: list[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def strokes(edge: np.ndarray, ends: np.ndarray) -> list[tuple[float, float]]:
-    """First and last coordinate of each run of True in `edge` (n,), between `ends` (n + 1,)."""
+    """First and last coordinate of each interval of True in `edge` (n,), given `ends` (n + 1,)."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], edge, [False]]).astype(int)))
-    return [(ends[a], ends[b]) for a, b in change.reshape(-1, 2)]
+    return [(ends[first], ends[last]) for first, last in change.reshape(-1, 2)]
 
 
 def outline(free: list[Box], solid: list[Box] = ()) -> np.ndarray:
-    """Walls (S, 4) around the union of the boxes `free`, less the boxes `solid`.
+    """Walls (S, 4) [m] around the union of the boxes `free`, less the boxes `solid`.
 
-    The boxes' sides cut the plane into cells that are free or not; walls stand between the two,
-    and every boundary they make is closed.
+    The sides of the boxes cut the plane into cells that are free or not. Walls separate the two,
+    and every boundary is closed.
     """
     boxes = np.array([*free, *solid])
     x, y = np.unique(boxes[:, [0, 2]]), np.unique(boxes[:, [1, 3]])
     middle_x, middle_y = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
     inside = covers(free, middle_x, middle_y) & ~covers(list(solid), middle_x, middle_y)
-    step = np.diff(np.pad(inside, 1).astype(int), axis=0)[:, 1:-1]  # across the lines x
-    rise = np.diff(np.pad(inside, 1).astype(int), axis=1)[1:-1]  # across the lines y
+    change_x = np.diff(np.pad(inside, 1).astype(int), axis=0)[:, 1:-1]  # across the lines x
+    change_y = np.diff(np.pad(inside, 1).astype(int), axis=1)[1:-1]  # across the lines y
     walls = []
     for sign in (1, -1):
-        walls += [
-            (c, a, c, b) for c, e in zip(x, step, strict=True) for a, b in strokes(e == sign, y)
-        ]
-        walls += [
-            (a, c, b, c) for c, e in zip(y, rise.T, strict=True) for a, b in strokes(e == sign, x)
-        ]
+        for at, change in zip(x, change_x, strict=True):
+            walls += [(at, low, at, high) for low, high in strokes(change == sign, y)]
+        for at, change in zip(y, change_y.T, strict=True):
+            walls += [(low, at, high, at) for low, high in strokes(change == sign, x)]
     return np.array(walls)
 
 
 def polyline(points: list[tuple[float, float]]) -> np.ndarray:
-    """Walls (K - 1, 4) that join K points in order."""
+    """Walls (N - 1, 4) [m] that join N points in order."""
     points = np.array(points)
     return np.hstack([points[:-1], points[1:]])
 
 
 def object_ahead() -> np.ndarray:
-    """Fig. 4: a box that shows a sensor at the origin two perpendicular faces, in a room."""
+    """Fig. 4: a box in a room, of which a sensor at the origin sees two perpendicular faces."""
     return outline([(-0.5, -2.0, 3.0, 2.0)], [(1.4, 0.3, 2.0, 0.9)])
 
 
@@ -88,12 +90,13 @@ def column() -> np.ndarray:
 
 
 def stairs(at: list[float], out: list[float]) -> list[tuple[float, float]]:
-    """Points of a wall that steps to the lateral positions `out` [m], one at each x of `at`."""
-    return [(x, y) for x, a, b in zip(at, out[:-1], out[1:], strict=True) for y in (a, b)]
+    """Points of a wall with steps at x = `at` (N,) [m], between levels y = `out` (N + 1,) [m]."""
+    levels = zip(out[:-1], out[1:], strict=True)
+    return [(x, y) for x, before_after in zip(at, levels, strict=True) for y in before_after]
 
 
 def uneven() -> np.ndarray:
-    """Fig. 6 (d): both walls step in and out by at most 3 cm."""
+    """Fig. 6 (d): both walls have steps of at most 3 cm."""
     left = [1.2, 1.22, 1.19, 1.205, 1.18, 1.21, 1.2, 1.225, 1.2]
     right = [-1.2, -1.185, -1.21, -1.195, -1.22, -1.19, -1.215, -1.2]
     return corridor(
@@ -103,9 +106,9 @@ def uneven() -> np.ndarray:
 
 
 def room() -> np.ndarray:
-    """Fig. 7: 6 m x 5 m, parted by a wall with an opening, with a screen and a block."""
+    """Fig. 7: 6 m x 5 m, divided by a wall with an opening, with a screen and a block."""
     inner = [
-        (3.0, 0.0, 3.15, 1.5),  # the parting wall
+        (3.0, 0.0, 3.15, 1.5),  # the dividing wall
         (3.0, 2.7, 3.15, 5.0),
         (0.0, 2.75, 1.5, 2.9),  # the screen
         (4.2, 2.2, 5.0, 3.2),  # the block
@@ -179,11 +182,14 @@ BUILDERS = {
     "fig07": room,
     "office": office,
 }
+"""Functions that make the walls (S, 4) of each world."""
+
 NAMES = tuple(BUILDERS)
+"""Names of the worlds."""
 
 DRIVES = {
     "office": [
-        (1.0, 0.9),  # S
+        (1.0, 0.9),  # start
         (3.5, 0.9),
         (3.5, 3.6),
         (4.5, 5.0),
@@ -207,9 +213,10 @@ DRIVES = {
         (10.35, 7.4),
         (1.0, 7.4),
         (1.0, 9.8),
-        (3.4, 9.8),  # F
+        (3.4, 9.8),  # finish
     ],
 }
+"""Waypoints [m] of a drive through some worlds."""
 
 PLACES = {
     "fig07": [
@@ -225,117 +232,171 @@ PLACES = {
         (3.9, 4.5, 0.39),
     ],
 }
+"""Poses [m, m, rad] from which some worlds are scanned."""
 
 
 def choose(table: dict, name: str, what: str):
-    """Entry `name` of a table of `what`; a ValueError names the entries there are."""
+    """Entry `name` of a table.
+
+    Args:
+        table: Entries by name.
+        name: The entry wanted.
+        what: What the entries are, for the message.
+
+    Raises:
+        ValueError: There is no such entry; the message lists those that exist.
+    """
     if name not in table:
         raise ValueError(f"no {what} named {name!r}; there are: {', '.join(table)}")
     return table[name]
 
 
 def named(name: str) -> World:
-    """World with one of the names `NAMES`."""
+    """World with one of the names `NAMES`.
+
+    Raises:
+        ValueError: There is no world of this name.
+    """
     return World(walls=choose(BUILDERS, name, "world")())
 
 
 def drive(name: str) -> np.ndarray:
-    """Way points (K, 2) [m] from S to F in the world `name`; straight lines join them."""
+    """Waypoints (N, 2) [m, world frame] of the drive through a world; straight lines join them.
+
+    Raises:
+        ValueError: There is no drive through a world of this name.
+    """
     return np.array(choose(DRIVES, name, "drive"))
 
 
 def places(name: str) -> np.ndarray:
-    """Poses (10, 3) from which the world `name` is scanned."""
+    """Poses (N, 3) [m, m, rad, world frame] from which a world is scanned.
+
+    Raises:
+        ValueError: There are none for a world of this name.
+    """
     return np.array(choose(PLACES, name, "places"))
 
 
-PLAN_WALLS = 160  # S of every random floor plan
+PLAN_WALLS = 160
+"""Number of walls S of every random floor plan, padding included."""
+
+ROOM_SIDE = 2.0  # [m] shortest side of a room
 
 
-def _rooms(rng: np.random.Generator, box: Box, thick: float) -> tuple[list[Box], list[Box]]:
-    """Rooms of a box and the doors between them, by cutting it in two again and again."""
-    x0, y0, x1, y1 = box
-    size = np.array([x1 - x0, y1 - y0])
-    axis = int(rng.random() < size[1] / size.sum())  # the longer side is cut more often
-    least = 2.0
-    if size[axis] < 2 * least + thick or size.prod() < rng.uniform(8.0, 22.0):
-        return [box], []
-    cut = rng.uniform(box[axis] + least, box[axis + 2] - least - thick)
-    low, high = list(box), list(box)
-    low[axis + 2], high[axis] = cut, cut + thick
-    parts = [_rooms(rng, tuple(part), thick) for part in (low, high)]
-    rooms, doors = (parts[0][k] + parts[1][k] for k in range(2))
-    # A door where both sides are rooms along its whole width.
+def _find_door(
+    rng: np.random.Generator, rooms: list[Box], box: Box, axis: int, cut: float, thick: float
+) -> list[Box]:
+    """A door through the wall from `cut` to `cut` + `thick` along `axis`; none after 50 tries.
+
+    A single room must lie behind the whole width of the door on either side, 0.1 m wider.
+    """
     across = 1 - axis
     width = rng.uniform(0.85, 1.5)
+
+    def opens_into(room: Box, side: int, position: float, start: float) -> bool:
+        return (
+            np.isclose(room[side], position)
+            and room[across] <= start - 0.1
+            and start + width + 0.1 <= room[across + 2]
+        )
+
+    sides = ((axis + 2, cut), (axis, cut + thick))
     for _ in range(50):
         start = rng.uniform(box[across] + 0.2, box[across + 2] - 0.2 - width)
-        side = lambda edge, room: np.isclose(room[edge[0]], edge[1])
-        spans = [
-            any(
-                side(edge, room)
-                and room[across] <= start - 0.1
-                and start + width + 0.1 <= room[across + 2]
-                for room in rooms
-            )
-            for edge in ((axis + 2, cut), (axis, cut + thick))
-        ]
-        if all(spans):
+        if all(any(opens_into(room, *side, start) for room in rooms) for side in sides):
             door = [0.0] * 4
             door[axis], door[axis + 2] = cut, cut + thick
             door[across], door[across + 2] = start, start + width
-            return rooms, [*doors, tuple(door)]
-    return rooms, doors
+            return [tuple(door)]
+    return []
+
+
+def _rooms(rng: np.random.Generator, box: Box, thick: float) -> tuple[list[Box], list[Box]]:
+    """Rooms of a box and the doors between them: binary space partitioning.
+
+    Args:
+        rng: Generator of the random cuts.
+        box: [m] the space to divide.
+        thick: [m] thickness of the walls.
+    """
+    x0, y0, x1, y1 = box
+    size = np.array([x1 - x0, y1 - y0])
+    axis = int(rng.random() < size[1] / size.sum())  # the longer side is cut more often
+    if size[axis] < 2 * ROOM_SIDE + thick or size.prod() < rng.uniform(8.0, 22.0):
+        return [box], []
+    cut = rng.uniform(box[axis] + ROOM_SIDE, box[axis + 2] - ROOM_SIDE - thick)
+    low, high = list(box), list(box)
+    low[axis + 2], high[axis] = cut, cut + thick
+    halves = [_rooms(rng, tuple(half), thick) for half in (low, high)]
+    rooms, doors = (halves[0][k] + halves[1][k] for k in range(2))
+    return rooms, [*doors, *_find_door(rng, rooms, box, axis, cut, thick)]
+
+
+def _turned(points: np.ndarray, angle: float) -> np.ndarray:
+    """Points (N, 2) turned counter-clockwise by an angle [rad] about the origin."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([[cos, sin], [-sin, cos]])
+
+
+def _block(rng: np.random.Generator, room: Box) -> list[np.ndarray]:
+    """A box in a room, half of the time at an angle; none in a room that is too small for it."""
+    x0, y0, x1, y1 = room
+    half = rng.uniform(0.15, 0.4, 2)
+    margin = np.hypot(*half) + 0.75
+    if min(x1 - x0, y1 - y0) <= 2 * margin:
+        return []
+    middle = rng.uniform([x0 + margin, y0 + margin], [x1 - margin, y1 - margin])
+    angle = rng.choice([0.0, rng.uniform(-0.8, 0.8)])
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
+    return [polyline(middle + _turned(corners, angle))]
+
+
+def _chamfer(rng: np.random.Generator, room: Box, doors: list[Box]) -> list[np.ndarray]:
+    """A slanting wall across a corner of a room; none where it would block a door."""
+    x0, y0, x1, y1 = room
+    legs = rng.uniform(0.6, 1.4, 2)
+    x, y = (x0, x1)[int(rng.integers(2))], (y0, y1)[int(rng.integers(2))]
+    first = (x + (legs[0] if x == x0 else -legs[0]), y)
+    second = (x, y + (legs[1] if y == y0 else -legs[1]))
+    low, high = np.minimum(first, second) - 0.1, np.maximum(first, second) + 0.1
+    blocks_door = any(
+        door[2] >= low[0] and door[0] <= high[0] and door[3] >= low[1] and door[1] <= high[1]
+        for door in doors
+    )
+    return [] if blocks_door else [np.array([[*first, *second]])]
 
 
 def _furniture(rng: np.random.Generator, rooms: list[Box], doors: list[Box]) -> list[np.ndarray]:
-    """Boxes turned at random in some of the rooms, and corners cut off by a slanting wall."""
+    """Walls of boxes in 45 % of the rooms, and of chamfered corners in 30 %."""
     pieces = []
-    for x0, y0, x1, y1 in rooms:
+    for room in rooms:
         kind = rng.random()
         if kind < 0.45:
-            half = rng.uniform(0.15, 0.4, 2)
-            reach = np.hypot(*half) + 0.75
-            if min(x1 - x0, y1 - y0) > 2 * reach:
-                middle = rng.uniform([x0 + reach, y0 + reach], [x1 - reach, y1 - reach])
-                turn = rng.choice([0.0, rng.uniform(-0.8, 0.8)])
-                c, s = np.cos(turn), np.sin(turn)
-                square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
-                pieces.append(polyline(middle + square @ np.array([[c, s], [-s, c]])))
+            pieces += _block(rng, room)
         elif kind < 0.75:
-            legs = rng.uniform(0.6, 1.4, 2)
-            x, y = (x0, x1)[int(rng.integers(2))], (y0, y1)[int(rng.integers(2))]
-            a = (x + (legs[0] if x == x0 else -legs[0]), y)
-            b = (x, y + (legs[1] if y == y0 else -legs[1]))
-            low, high = np.minimum(a, b) - 0.1, np.maximum(a, b) + 0.1
-            clear = lambda d, low=low, high=high: (
-                d[2] < low[0] or d[0] > high[0] or d[3] < low[1] or d[1] > high[1]
-            )
-            if all(clear(door) for door in doors):
-                pieces.append(np.array([[*a, *b]]))
+            pieces += _chamfer(rng, room, doors)
     return pieces
 
 
 def floor_plan(key: Key, *, size: tuple[float, float] = (13.0, 10.0)) -> World:
-    """Random floor plan of rooms joined by doors; boxes and slanting walls stand in some rooms.
+    """Random floor plan of rooms joined by doors, with boxes and chamfered corners in some rooms.
 
     Args:
-        key: Of the random numbers.
+        key: Key of the random numbers.
         size: Length and width [m]; from about 5 x 5 m on.
 
     Returns:
-        `PLAN_WALLS` walls, the last of them without length: padding that nothing sees. The plan
-        is turned by a random angle about its first corner.
+        `PLAN_WALLS` walls, the last ones of zero length: invisible padding. The plan is turned by a
+        random angle about its first corner.
 
     Raises:
-        ValueError: If the plan needs more walls than that.
+        ValueError: The plan needs more walls than that.
     """
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     rooms, doors = _rooms(rng, (0.0, 0.0, *size), 0.15)
     walls = np.vstack([outline(rooms + doors), *_furniture(rng, rooms, doors)])
     if len(walls) > PLAN_WALLS:
         raise ValueError(f"size {size}: {len(walls)} walls, {PLAN_WALLS} at most; ask for less")
-    turn = rng.uniform(-np.pi, np.pi)
-    c, s = np.cos(turn), np.sin(turn)
-    walls = (walls.reshape(-1, 2) @ np.array([[c, s], [-s, c]])).reshape(-1, 4)
+    walls = _turned(walls.reshape(-1, 2), rng.uniform(-np.pi, np.pi)).reshape(-1, 4)
     return World(walls=np.pad(walls, ((0, PLAN_WALLS - len(walls)), (0, 0))))

@@ -102,13 +102,13 @@ BROKEN = {
     "cut before the poses": (" ".join(flaser(3).split()[:7]), "cut or damaged: 7 fields"),
     "cut in the readings": (" ".join(flaser(3).split()[:4]), "cut or damaged: 4 fields"),
     "cut before the host": (" ".join(flaser(3).split()[:-2]), "cut or damaged: 13 fields"),
-    "cut after the keyword": ("FLASER", "no number of beams"),
+    "cut after the keyword": ("FLASER", "is not a beam count"),
     "cut ODOM": ("ODOM 0.1 0.2", "cut or damaged: 3 fields instead of 10"),
     "two lines in one": (flaser(3) + flaser(4), "cut or damaged"),
     "NaN range": (flaser(3, ranges=[1, 2, "nan", 3]), "field 5 (range 3): nan is not finite"),
     "word for a range": (flaser(3, ranges=[1, 2, 3, "x1"]), "field 6 (range 4): 'x1' is not a num"),
     "word for the count": ("FLASER many 1 2", "field 2 (n): 'many' is not a number"),
-    "part of a beam": ("FLASER 1.5 1 2", "field 2 (n): 1.5 is no number of beams"),
+    "part of a beam": ("FLASER 1.5 1 2", "field 2 (n): 1.5 is not a beam count"),
     "infinite pose": (flaser(3, pose=(1, "inf", 2)), "field 11 (odom_y): inf is not finite"),
     "NaN ODOM pose": (odom(3).replace("0.03", "nan"), "field 4 (theta): nan is not finite"),
     "NaN time": (flaser("nan", pose=(1, 2, 3)), "field 13 (ipc_time): nan is not finite"),
@@ -206,7 +206,7 @@ def test_files_that_are_no_log(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("reach", [0.0, -1.0, math.inf, math.nan])
 def test_impossible_reach(tmp_path, reach):
-    with pytest.raises(InputError, match="reach .* give a positive number"):
+    with pytest.raises(InputError, match="range_max .* give a positive number"):
         carmen.read(save(tmp_path / "a.clf", good()), reach=reach)
 
 
@@ -314,7 +314,7 @@ def test_odometry_that_starts_anew_goes_on_where_it_was(tmp_path):
     wanted = np.array([seen_from(way(t), way(t + 1)) for t in log.times[:-1]])
     assert np.abs(moved[32:] - wanted[32:]).max() < 0.01
     assert np.hypot(*moved[29:32, :2].T).max() < 1.1  # it stood still for half a second
-    assert len(log.mended) == 1 and "starts anew (1 x)" in log.mended[0]
+    assert len(log.mended) == 1 and "restarts (1 x)" in log.mended[0]
     alone = [line for line in drive(anew, anew) if line.startswith("FLASER")]
     log = carmen.read(save(tmp_path / "b.clf", alone))
     assert len(log.mended) == 1 and np.hypot(*np.diff(log.odometry, axis=0).T[:2]).max() < 1.1

@@ -53,7 +53,7 @@ def complaint(path, template=None, about=ABOUT):
         checkpoint.read(path, state() if template is None else template, about)
     text = str(caught.value)
     assert "\n" not in text and text.startswith(f"{path}: ")
-    assert text.endswith("; remove it to begin anew, or name another folder by --out")
+    assert text.endswith("; remove it to start again, or name another folder by --out")
     return text.removeprefix(f"{path}: ").split(";")[0]
 
 

@@ -134,7 +134,7 @@ def test_simulate_measures_what_it_promises(done):
 
 
 def test_simulate_tells_its_first_result_and_a_summary(done):
-    assert "first 2 runs: position RMSE" in done.said + done.errors
+    assert "first 2 trials: position RMSE" in done.said + done.errors
     assert "2/2" in done.errors
     assert "position RMSE" in done.said and str(done.simulated) in done.said
     assert len(done.said.splitlines()) < 24

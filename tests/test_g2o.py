@@ -105,8 +105,8 @@ def replaced(line, text):
     "text, message",
     [
         (replaced(0, "VERTEX_SE2 0 9 9"), r"graph.g2o:1: cut or damaged: 4 fields instead of 5"),
-        (replaced(0, "VERTEX_SE2 0.5 9 9 9"), r":1: field 2: 0.5 is no whole number"),
-        (replaced(2, "VERTEX_SE2 0 9 9 9"), r"vertex 0 comes twice"),
+        (replaced(0, "VERTEX_SE2 0.5 9 9 9"), r":1: field 2: 0.5 is not an integer"),
+        (replaced(2, "VERTEX_SE2 0 9 9 9"), r"vertex 0 occurs twice"),
         (replaced(13, "EDGE_SE2 0 1 1 2 x 1 0 0 1 0 1"), r":14: x y theta: 'x' is not a number"),
         (replaced(13, "# none"), r"no EDGE_SE2 from vertex 0 to the next, 1"),
         (replaced(1, laser(ranges()[0], "nan")), r":2: time: nan is not finite \(1 of 6"),

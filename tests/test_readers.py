@@ -41,7 +41,7 @@ def test_readings_from_the_reach_on_are_none(files):
 
 
 def test_topics_are_those_of_bags(files, tmp_path):
-    with pytest.raises(InputError, match="has no topics; name topics of bags only"):
+    with pytest.raises(InputError, match="has no topics; name topics only for ROS bags"):
         readers.read(files / "a", scans="/scan")
     bag = test_bags.write(tmp_path / "drive.bag", 1)
     found = readers.read(bag, scans="/scan", odometry="/odom")
@@ -53,7 +53,7 @@ def test_topics_are_those_of_bags(files, tmp_path):
 @pytest.mark.parametrize(
     "content, message",
     [
-        (b"hello\n" * 5000, "is no log that can be read; known are"),
+        (b"hello\n" * 5000, "is a log of no known format; the formats are"),
         (b"\0\1\2", "is binary"),
         (b"", "is empty"),
         (b"PK\3\4 broken", "zip archive that cannot be read"),

@@ -181,7 +181,7 @@ def test_it_says_how_sure_it_is(done):
 def test_it_shows_how_far_it_is_and_a_summary(done):
     assert f"{STEPS + 1}/{STEPS + 1}" in done.errors and "heldout=" in done.errors
     said = done.said.splitlines()
-    assert said[0] == f"{ROBOTS - 1} recorded drives, {4 * 39} steps; held out: 1"
+    assert said[0] == f"{ROBOTS - 1} logs, {4 * 39} steps; held out: 1"
     table = {line.split()[0]: line.split()[1:] for line in said if line.startswith("  ")}
     assert float(table["loss"][0]) == pytest.approx(done.numbers["before"]["loss"], rel=1e-3)
     assert float(table["loss"][1]) == pytest.approx(done.numbers["loss"], rel=1e-3)
@@ -197,9 +197,9 @@ def test_a_kill_loses_no_evaluation(stopped):
 
 def test_an_interrupt_leaves_the_best_so_far_and_says_how_to_go_on(stopped):
     said, errors = stopped.interrupted
-    assert f"going on after evaluation {stopped.history[-1]} of {STEPS + 1}" in said
+    assert f"resuming after evaluation {stopped.history[-1]} of {STEPS + 1}" in said
     line = errors.splitlines()[-1]
-    assert line.startswith("jaxslam: interrupted after ") and "the same command goes on" in line
+    assert line.startswith("jaxslam: interrupted after ") and "the same command resumes" in line
     assert f" of {STEPS + 1} evaluations; {stopped.out / 'noise.json'} holds" in line
     assert "Traceback" not in errors
     assert stopped.found == {"noise.json", tuning.CHECKPOINT}
@@ -258,7 +258,7 @@ def test_another_tuning_does_not_go_on_in_the_same_folder(stopped, done, refused
 def test_what_was_stopped_ends_as_what_was_not(stopped, done):
     """The last test of a stopped tuning: it goes on to the end."""
     said, _ = end(begin(done.place, stopped.out))
-    assert "going on after evaluation" in said
+    assert "resuming after evaluation" in said
     assert {file.name for file in stopped.out.iterdir()} >= FILES
     assert not (stopped.out / tuning.CHECKPOINT).exists()
     assert (stopped.out / "noise.json").read_bytes() == (done.out / "noise.json").read_bytes()
@@ -305,8 +305,8 @@ def drives(tmp_path):
         (["--freeze", "rnage"], "--freeze: no parameter is called 'rnage'; known: odometry[0], "),
         (["--freeze", "odometry[4]"], "--freeze: no parameter is called 'odometry[4]'"),
         (["--freeze", *slam.Noise._fields], "--freeze: all parameters are frozen"),
-        (["--test", "some.clf"], "--test, --reference: go with recorded logs"),
-        (["--reference", "some.tum"], "--test, --reference: go with recorded logs"),
+        (["--test", "some.clf"], "--test, --reference: apply to logs only"),
+        (["--reference", "some.tum"], "--test, --reference: apply to logs only"),
         (["missing.clf"], "missing.clf: does not exist"),
         (["missing/Robot1"], "missing/Robot1: does not exist"),
         (["--noise", "missing.json"], "missing.json: does not exist"),
@@ -377,13 +377,13 @@ def test_references_are_as_many_as_logs_and_on_their_clock(refused, log, referen
 
 
 def test_logs_of_one_kind_and_scanner_are_tuned_together(refused, log, drives, reference, tmp_path):
-    apart = "LOG: logs of scans and MRCLAM data sets are tuned apart"
+    apart = "LOG: laser logs and MRCLAM data sets are tuned separately"
     assert refused(log, drives).startswith(apart)
     assert refused(drives, "--test", log).startswith(apart)
-    assert refused(drives, "--reference", reference).startswith("--reference: MRCLAM data sets br")
+    assert refused(drives, "--reference", reference).startswith("--reference: MRCLAM data sets co")
     other = write_carmen(tmp_path / "b.clf", beams=7)
     line = refused(log, other, "--reference", reference, reference)
-    assert line.startswith(f"{other}: has another scanner than {log}; tune them apart")
+    assert line.startswith(f"{other}: has another scanner than {log}; tune them separately")
     assert carmen.read(other).lidar != carmen.read(log).lidar
 
 

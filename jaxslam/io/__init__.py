@@ -1,1 +1,1 @@
-"""Reading logs and writing results: one module a format; nothing else touches files."""
+"""Reading logs and writing results: one module per format; no other module accesses files."""

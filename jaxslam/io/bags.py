@@ -1,10 +1,12 @@
-"""Bags of ROS 1 and ROS 2, by the library rosbags: no ROS is needed.
+"""ROS 1 and ROS 2 bags, read by the library rosbags; ROS itself is not needed.
 
-Scans are `sensor_msgs/LaserScan`. Poses of the wheels are `nav_msgs/Odometry` or, where there is
-none, the transform from `odom` in `/tf`. Where the scanner sits on the robot is looked up in the
-transforms; without any it is the robot's origin. The poses of the recording are the scanner's.
+Scans are `sensor_msgs/LaserScan`. Odometry is `nav_msgs/Odometry` or, without such a topic, the
+transform from `odom` to the robot in `/tf`. The pose of the scanner in the robot frame
+(`base_link`) is taken from the transforms; without any, the scanner is at the origin of the robot.
+The poses of the log are those of the scanner.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
@@ -21,35 +23,53 @@ from jaxslam.poses import composed, interpolate
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"  # the latter in old bags
-FIXED = "odom"  # frame in which wheels count
+FIXED = "odom"  # frame of the odometry
 CHAIN = 32  # transforms between two frames at most
 
 
 class Choice(NamedTuple):
-    """Where the scans and the poses of a bag come from."""
+    """Topics that a log is read from.
 
-    scans: str  # topic
-    odometry: str  # topic
+    Attributes:
+        scans: Topic of the laser scans.
+        odometry: Topic of the odometry or of the transforms.
+    """
+
+    scans: str
+    odometry: str
 
 
 class _Scan(NamedTuple):
+    """One `LaserScan` message."""
+
     time: float  # [s]
-    first: float  # [rad]
-    step: float  # [rad]
-    reach: float  # [m]
-    ranges: np.ndarray  # (R,) float64 [m]
+    angle_min: float  # [rad]
+    angle_increment: float  # [rad]
+    range_max: float  # [m]
+    ranges: np.ndarray  # (R,) float64 [m], infinite where below the scanner's range_min
 
 
-class _Link(NamedTuple):
-    """How a frame sits in its parent, over time."""
+class _Transform(NamedTuple):
+    """The pose of a frame in its parent frame over time."""
 
     parent: str
     times: list[float]  # [s]
-    moves: list[tuple[float, ...]]  # x y z [m], and the quaternion x y z w
+    values: list[tuple[float, ...]]  # translation x y z [m], quaternion x y z w
+
+
+class _Messages(NamedTuple):
+    """Content of the messages of a bag."""
+
+    scans: list[_Scan]  # those that are not broken
+    broken: int  # number of broken scans
+    scan_frame: str  # "" without scans
+    base_frame: str  # frame of the robot; "" if unknown
+    odometry: list[tuple[float, float, float, float]]  # t x y heading [s, m, m, rad] of the robot
+    transforms: dict[str, _Transform]  # by child frame
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file or folder is called as bags are."""
+    """Whether the name of a file, or the content of a folder, is that of a bag."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     return path.suffix in (".bag", ".db3", ".mcap")
@@ -66,134 +86,151 @@ def read(
 
     Args:
         path: The bag.
-        reach: Range [m] from which on a reading counts as no return, if the scanner's is not
-            smaller; so does one below the scanner's least range.
-        scans: Topic of the laser scans; that with most of them unless given.
-        odometry: Topic of the odometry, or of the transforms; likewise.
+        reach: Range [m] from which on a reading counts as no return, unless the scanner's own
+            range_max is smaller; so does a reading below the scanner's range_min.
+        scans: Topic of the laser scans; by default the one with most messages.
+        odometry: Topic of the odometry or of the transforms; by default the one with most messages.
 
     Raises:
         InputError: rosbags is not installed, the bag cannot be read or lacks scans or odometry, or
             more than 5 % of its scans are broken.
     """
-    with _opened(Path(path)) as bag:
-        chosen = _choose(path, bag, scans, odometry)
-        return _recording(path, bag, chosen, reach)
+    with _open_bag(Path(path)) as bag:
+        chosen = _choose_topics(path, bag, scans, odometry)
+        return _build_log(path, chosen, _read_messages(path, bag, chosen), reach)
 
 
 def topics(path: str | PathLike) -> Choice:
-    """What `read` takes of a bag unless told.
+    """The topics that `read` uses by default.
 
     Raises:
         InputError: As `read`.
     """
-    with _opened(Path(path)) as bag:
-        return _choose(path, bag, None, None)
+    with _open_bag(Path(path)) as bag:
+        return _choose_topics(path, bag, None, None)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """The bag; whatever a broken one raises while it is read is told in one line."""
+def _open_bag(path: Path) -> Iterator[Any]:
+    """Open a bag; any error while it is read becomes an InputError."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         advice = "pip install '.[ros]'"
         raise InputError("is a ROS bag, which needs rosbags", path=path, advice=advice) from None
-    whole = path.parent if path.suffix in (".db3", ".mcap") else path
-    if not whole.exists():
+    bag_path = path.parent if path.suffix in (".db3", ".mcap") else path
+    if not bag_path.exists():
         raise InputError("does not exist", path=path, advice="check the name")
     try:
-        with AnyReader([whole], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        with AnyReader([bag_path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
             yield bag
     except InputError:
         raise
-    except Exception as error:  # what damage raises in the readers of bags is listed nowhere
-        said = " ".join(str(error).split())[:200]
-        problem = f"is a bag that cannot be read ({type(error).__name__}: {said})"
+    except Exception as error:  # rosbags does not document what a damaged bag raises
+        reason = " ".join(str(error).split())[:200]
+        problem = f"is a bag that cannot be read ({type(error).__name__}: {reason})"
         raise InputError(problem, path=path, advice="copy it again, or reindex it") from None
 
 
-def _choose(path: str | PathLike, bag: Any, scans: str | None, odometry: str | None) -> Choice:
-    """Topics of a bag."""
-    kinds = {one.topic: one.msgtype for one in bag.connections}
-    count = lambda topic: sum(one.msgcount for one in bag.connections if one.topic == topic)
+def _choose_topics(
+    path: str | PathLike, bag: Any, scans: str | None, odometry: str | None
+) -> Choice:
+    """The requested topics; of those not requested, the topic with most messages."""
+    types = {connection.topic: connection.msgtype for connection in bag.connections}
+    counts = Counter()
+    for connection in bag.connections:
+        counts[connection.topic] += connection.msgcount
 
-    def pick(wanted: str | None, field: str, *allowed: str) -> str:
-        known = {topic: kind for topic, kind in kinds.items() if kind in allowed and count(topic)}
-        told = f"topics of that kind: {', '.join(sorted(known)) or 'none'}"
-        if wanted is not None and wanted not in known:
-            problem = f"there is no {allowed[0]} in {wanted!r}"
-            raise InputError(problem, path=path, field=field, advice=told)
-        if not known:
+    def choose(requested: str | None, field: str, allowed: tuple[str, ...]) -> str:
+        usable = {name: kind for name, kind in types.items() if kind in allowed and counts[name]}
+        if requested is not None and requested not in usable:
+            problem = f"there is no {allowed[0]} in {requested!r}"
+            advice = f"topics of that type: {', '.join(sorted(usable)) or 'none'}"
+            raise InputError(problem, path=path, field=field, advice=advice)
+        if not usable:
             names = " or ".join(allowed)
-            listed = ", ".join(sorted(kinds)) or "none"
+            listed = ", ".join(sorted(types)) or "none"
             advice = f"name another bag; its topics are: {listed}"
             raise InputError(f"has no {names}", path=path, advice=advice)
-        first = min(allowed.index(kind) for kind in known.values())
-        best = [topic for topic, kind in known.items() if allowed.index(kind) == first]
-        return wanted or max(sorted(best), key=count)
+        preferred = min(allowed.index(kind) for kind in usable.values())
+        best = [name for name, kind in usable.items() if allowed.index(kind) == preferred]
+        return requested or max(sorted(best), key=counts.__getitem__)
 
-    return Choice(pick(scans, "scans", SCAN), pick(odometry, "odometry", ODOMETRY, *TRANSFORMS))
+    return Choice(
+        choose(scans, "scans", (SCAN,)),
+        choose(odometry, "odometry", (ODOMETRY, *TRANSFORMS)),
+    )
 
 
-def _recording(path: str | PathLike, bag: Any, chosen: Choice, reach: float) -> Recording:
-    kept: list[_Scan] = []
-    frame, base = "", ""
-    wheels: list[tuple[float, float, float, float]] = []
-    links: dict[str, _Link] = {}
+def _read_messages(path: str | PathLike, bag: Any, chosen: Choice) -> _Messages:
+    """Read the chosen topics and all transforms."""
+    scans: list[_Scan] = []
+    odometry: list[tuple[float, float, float, float]] = []
+    transforms: dict[str, _Transform] = {}
+    scan_frame, base_frame = "", ""
     broken = 0
-    wanted = [
-        one
-        for one in bag.connections
-        if one.topic in chosen or (one.msgtype in TRANSFORMS and "tf" in one.topic)
+    connections = [
+        connection
+        for connection in bag.connections
+        if connection.topic in chosen
+        or (connection.msgtype in TRANSFORMS and "tf" in connection.topic)
     ]
-    count = sum(one.msgcount for one in wanted)
-    messages = bag.messages(connections=wanted)
+    count = sum(connection.msgcount for connection in connections)
+    messages = bag.messages(connections=connections)
     for connection, _, raw in shown(messages, Path(path), "message", count):
         message = bag.deserialize(raw, connection.msgtype)
         if connection.topic == chosen.scans:
-            one = _scan(message, reach)
-            broken += one is None
-            if one is not None:
-                kept.append(one)
-                frame = frame or _plain(message.header.frame_id)
+            scan = _parse_scan(message)
+            broken += scan is None
+            if scan is not None:
+                scans.append(scan)
+                scan_frame = scan_frame or _frame_name(message.header.frame_id)
         elif connection.msgtype == ODOMETRY:
             pose = message.pose.pose
-            moved = _flat(pose.position, pose.orientation)
-            base = base or _plain(message.child_frame_id)
-            if np.isfinite(moved).all():
-                wheels.append((_seconds(message.header.stamp), *moved))
+            planar = _planar_pose(pose.position, pose.orientation)
+            base_frame = base_frame or _frame_name(message.child_frame_id)
+            if np.isfinite(planar).all():
+                odometry.append((_seconds(message.header.stamp), *planar))
         else:
-            for one in message.transforms:
-                _note(links, one)
-    if not wheels:
-        base, wheels = _from_links(path, links)
-    kept, odd = _alike(kept)
-    stream = np.array(sorted(wheels))
-    inside = [one for one in kept if stream[0, 0] <= one.time <= stream[-1, 0]]
-    left = broken + odd + len(kept) - len(inside)
-    total = len(inside) + left
-    if not inside or left > TOLERATED * total:
-        problem = f"{left} of {total} scans are broken, or outside the time of {chosen.odometry}"
+            for transform in message.transforms:
+                _add_transform(transforms, transform)
+    if not odometry:
+        base_frame, odometry = _odometry_of_transforms(path, transforms)
+    return _Messages(scans, broken, scan_frame, base_frame, odometry, transforms)
+
+
+def _build_log(
+    path: str | PathLike, chosen: Choice, messages: _Messages, range_max: float
+) -> Recording:
+    """Interpolate the odometry at the scans; move it to the scanner; beams counter-clockwise."""
+    scans, other_scanner = _with_first_scanner(messages.scans)
+    stream = np.array(sorted(messages.odometry))
+    inside = [scan for scan in scans if stream[0, 0] <= scan.time <= stream[-1, 0]]
+    skipped = messages.broken + other_scanner + len(scans) - len(inside)
+    total = len(inside) + skipped
+    if not inside or skipped > TOLERATED * total:
+        problem = f"{skipped} of {total} scans are broken, or outside the time of {chosen.odometry}"
         raise InputError(problem, path=path, advice="compare their time stamps")
-    mount, flipped = _mount(links, frame, base)
+    mount, flipped = _mount_pose(messages.transforms, messages.scan_frame, messages.base_frame)
     poses = composed(stream[:, 1:], mount)
-    times = np.array([one.time for one in inside])
+    times = np.array([scan.time for scan in inside])
     order = np.argsort(times, kind="stable")
-    ranges = np.array([inside[i].ranges for i in order])
+    ranges = np.array([inside[index].ranges for index in order])
     first = inside[0]
-    start, step = first.first, first.step
-    if (step < 0.0) != flipped:  # beams from right to left as the robot sees it
-        ranges, start = ranges[:, ::-1], start + step * (ranges.shape[1] - 1)
+    angle_min, angle_increment = first.angle_min, first.angle_increment
+    if (angle_increment < 0.0) != flipped:  # the beams are clockwise in the robot frame
+        ranges = ranges[:, ::-1]
+        angle_min = angle_min + angle_increment * (ranges.shape[1] - 1)
     if flipped:
-        start = -start
-    reach = min(reach, first.reach)
+        angle_min = -angle_min
+    range_max = min(range_max, first.range_max)
     return Recording(
         times=times[order],
         odometry=interpolate(times[order], stream[:, 0], poses),
-        ranges=no_return(ranges, reach),
-        lidar=Lidar(ranges.shape[1], start, abs(step), reach, NOISE),
-        skipped=left,
+        ranges=no_return(ranges, range_max),
+        lidar=Lidar(ranges.shape[1], angle_min, abs(angle_increment), range_max, NOISE),
+        skipped=skipped,
         wheel_times=stream[:, 0],
         wheel_poses=poses,
         source=f", scans of {chosen.scans}, odometry of {chosen.odometry}",
@@ -204,86 +241,100 @@ def _seconds(stamp: Any) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
-def _plain(frame: str) -> str:
+def _frame_name(frame: str) -> str:
     return frame.removeprefix("/")
 
 
-def _scan(message: Any, reach: float) -> _Scan | None:
-    """A scan; None if it is broken."""
+def _parse_scan(message: Any) -> _Scan | None:
+    """The scan of a message; None if it is broken."""
     ranges = np.asarray(message.ranges, np.float64).copy()
-    step, most = float(message.angle_increment), float(message.range_max)
-    numbers = float(message.angle_min), step, most
-    if ranges.size < 2 or not np.isfinite(numbers).all() or step == 0.0 or most <= 0.0:
+    increment, range_max = float(message.angle_increment), float(message.range_max)
+    metadata = float(message.angle_min), increment, range_max
+    if ranges.size < 2 or not np.isfinite(metadata).all() or increment == 0.0 or range_max <= 0.0:
         return None
     ranges[~(ranges >= max(float(message.range_min), 0.0))] = np.inf
-    return _Scan(_seconds(message.header.stamp), numbers[0], step, most, ranges)
+    return _Scan(_seconds(message.header.stamp), metadata[0], increment, range_max, ranges)
 
 
-def _alike(scans: list[_Scan]) -> tuple[list[_Scan], int]:
-    """Scans with the scanner of the first, and how many have another one."""
+def _with_first_scanner(scans: list[_Scan]) -> tuple[list[_Scan], int]:
+    """Scans with the metadata of the first, and the number of the others."""
     if not scans:
         return scans, 0
-    scanner = lambda one: (one.first, one.step, one.reach, one.ranges.size)
-    same = [one for one in scans if scanner(one) == scanner(scans[0])]
+
+    def metadata(scan: _Scan) -> tuple[float, ...]:
+        return scan.angle_min, scan.angle_increment, scan.range_max, scan.ranges.size
+
+    same = [scan for scan in scans if metadata(scan) == metadata(scans[0])]
     return same, len(scans) - len(same)
 
 
-def _flat(position: Any, turn: Any) -> tuple[float, float, float]:
+def _planar_pose(position: Any, rotation: Any) -> tuple[float, float, float]:
     """Pose in the plane of a position and a quaternion."""
-    heading = np.arctan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+    heading = np.arctan2(
+        2 * (rotation.w * rotation.z + rotation.x * rotation.y),
+        1 - 2 * (rotation.y**2 + rotation.z**2),
+    )
     return float(position.x), float(position.y), float(heading)
 
 
-def _note(links: dict[str, _Link], one: Any) -> None:
-    """Add a transform to those known."""
-    move, turn = one.transform.translation, one.transform.rotation
-    values = (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
+def _add_transform(transforms: dict[str, _Transform], message: Any) -> None:
+    """Add a `TransformStamped`; one that is not finite or has a second parent is skipped."""
+    position, rotation = message.transform.translation, message.transform.rotation
+    values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
     if not np.isfinite(values).all():
         return
-    child, parent = _plain(one.child_frame_id), _plain(one.header.frame_id)
-    link = links.setdefault(child, _Link(parent, [], []))
-    if link.parent == parent:
-        link.times.append(_seconds(one.header.stamp))
-        link.moves.append(values)
+    child, parent = _frame_name(message.child_frame_id), _frame_name(message.header.frame_id)
+    transform = transforms.setdefault(child, _Transform(parent, [], []))
+    if transform.parent == parent:
+        transform.times.append(_seconds(message.header.stamp))
+        transform.values.append(values)
 
 
 class _Vector(NamedTuple):
+    """A position, or a quaternion."""
+
     x: float
     y: float
     z: float
     w: float = 0.0
 
 
-def _from_links(
-    path: str | PathLike, links: dict[str, _Link]
+def _odometry_of_transforms(
+    path: str | PathLike, transforms: dict[str, _Transform]
 ) -> tuple[str, list[tuple[float, float, float, float]]]:
-    """The robot's frame and its poses over time, from the transforms."""
-    for child, link in links.items():
-        if link.parent == FIXED:
-            poses = [_flat(_Vector(*m[:3]), _Vector(*m[3:])) for m in link.moves]
-            return child, [(t, *pose) for t, pose in zip(link.times, poses, strict=True)]
+    """The robot frame, and its times and poses in the odometry frame."""
+    for child, transform in transforms.items():
+        if transform.parent == FIXED:
+            poses = [_planar_pose(_Vector(*v[:3]), _Vector(*v[3:])) for v in transform.values]
+            stamped = zip(transform.times, poses, strict=True)
+            return child, [(time, *pose) for time, pose in stamped]
     advice = "name a bag with odometry, or with the transform of the robot in `odom`"
     raise InputError(f"has no transform from {FIXED!r}", path=path, advice=advice)
 
 
-def _mount(links: dict[str, _Link], frame: str, base: str) -> tuple[np.ndarray, bool]:
-    """Pose (3,) of the scanner on the robot, and whether it hangs upside down."""
-    place, turn = np.zeros(3), np.eye(3)
+def _mount_pose(
+    transforms: dict[str, _Transform], scan_frame: str, base_frame: str
+) -> tuple[np.ndarray, bool]:
+    """Pose (3,) of the scanner in the robot frame, and whether it is mounted upside down."""
+    position, rotation = np.zeros(3), np.eye(3)
+    frame = scan_frame
     for _ in range(CHAIN):
-        if frame == base or frame not in links:
+        if frame == base_frame or frame not in transforms:
             break
-        link = links[frame]
-        x, y, z, qx, qy, qz, qw = link.moves[0]
-        turned_by = _matrix(qx, qy, qz, qw)
-        place, turn = np.array([x, y, z]) + turned_by @ place, turned_by @ turn
-        frame = link.parent
-    if frame != base:
+        transform = transforms[frame]
+        x, y, z, *quaternion = transform.values[0]
+        parent_rotation = _rotation_matrix(*quaternion)
+        position = np.array([x, y, z]) + parent_rotation @ position
+        rotation = parent_rotation @ rotation
+        frame = transform.parent
+    if frame != base_frame:
         return np.zeros(3), False
-    return np.array([*place[:2], np.arctan2(turn[1, 0], turn[0, 0])]), bool(turn[2, 2] < 0.0)
+    heading = np.arctan2(rotation[1, 0], rotation[0, 0])
+    return np.array([*position[:2], heading]), bool(rotation[2, 2] < 0.0)
 
 
-def _matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
-    """Rotation (3, 3) of a quaternion, of whatever length."""
+def _rotation_matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
+    """Rotation (3, 3) of a quaternion x y z w, which is normalised first."""
     x, y, z, w = np.array([x, y, z, w]) / (np.linalg.norm([x, y, z, w]) or 1.0)
     return np.array(
         [

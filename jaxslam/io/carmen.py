@@ -1,13 +1,13 @@
-"""Logs of the CARMEN toolkit, as most public 2-D laser logs are kept.
+"""Logs of the CARMEN toolkit, the format of most public 2-D laser logs.
 
     ODOM x y theta tv rv accel ipc_time host logger_time
     FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_time host logger_time
     ROBOTLASER1 ... (`robotlaser`)
 
-All other messages and comments are passed over, and ROBOTLASER1 too where there is FLASER, which
-then holds the same scans. Poses of ROBOTLASER1 are those of the laser. Where odometry was started
-anew, or the scans have poses that another program corrected, the wheels' own are put together again
-from the ODOM lines, and `Recording.mended` tells so.
+All other messages and comments are ignored, and so is ROBOTLASER1 in a log with FLASER, where both
+hold the same scans. Poses of ROBOTLASER1 are those of the laser. Where the odometry restarts, or
+the poses of the scans were corrected by another program, the odometry is rebuilt from the ODOM
+lines, and `Recording.mended` says so.
 """
 
 import math
@@ -31,6 +31,15 @@ _FORMS = {
     b"FLASER": "FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_time host logger_time",
 }
 
+_StampedPose = tuple[float, float, float, float]
+"""Time [s] and pose [m, m, rad]."""
+
+_FlaserScan = tuple[int, _StampedPose, np.ndarray]
+"""Line number, time and odometry pose, ranges (R,) [m] of a FLASER line."""
+
+_Broken = dict[int, tuple[bytes, str]]
+"""Keyword of each broken line and what is wrong with it, by line number."""
+
 
 def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
     """Read a CARMEN log, plain or gzipped, in file order.
@@ -44,71 +53,73 @@ def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
             FLASER lines are broken, there is no scan, or its odometry never changes.
     """
     if not 0.0 < reach < math.inf:
-        raise InputError(f"reach {reach} m", advice="give a positive number of metres")
-    wheels, scans, broken = [], [], {}
-    lasers: dict[int, Laser] = {}
+        raise InputError(f"range_max {reach} m", advice="give a positive number of metres")
+    odometry: list[_StampedPose] = []
+    flaser: list[_FlaserScan] = []
+    robotlaser1: dict[int, Laser] = {}
+    broken: _Broken = {}
     for line, text in lines(path):
         fields = text.split()
-        kind = fields[0] if fields else b""
+        keyword = fields[0] if fields else b""
         try:
-            if kind == b"ODOM":
-                wheels.append(_odom(fields))
-            elif kind == b"FLASER":
-                scans.append((line, *_flaser(fields)))
-            elif kind == b"ROBOTLASER1":
-                lasers[line] = robotlaser.parse(line, fields)
+            if keyword == b"ODOM":
+                odometry.append(_parse_odom(fields))
+            elif keyword == b"FLASER":
+                flaser.append((line, *_parse_flaser(fields)))
+            elif keyword == b"ROBOTLASER1":
+                robotlaser1[line] = robotlaser.parse(line, fields)
         except InputError as error:
-            broken[line] = kind, str(error)
-    newer = bool(lasers) and not scans
-    unused = b"FLASER" if newer else b"ROBOTLASER1"
-    broken = {line: one for line, one in broken.items() if one[0] != unused}
-    if newer:
-        lasers, odd = robotlaser.alike(lasers)
-        broken |= {line: (b"ROBOTLASER1", problem) for line, problem in odd.items()}
-        _check_broken(path, broken, len(wheels) + len(lasers) + len(broken))
-        return _newer(path, wheels, list(lasers.values()), len(broken), reach)
-    if not wheels and not scans and not broken:
+            broken[line] = keyword, str(error)
+    use_robotlaser1 = bool(robotlaser1) and not flaser
+    unused = b"FLASER" if use_robotlaser1 else b"ROBOTLASER1"
+    broken = {line: problem for line, problem in broken.items() if problem[0] != unused}
+    if use_robotlaser1:
+        robotlaser1, other_scanner = robotlaser.alike(robotlaser1)
+        broken |= {line: (b"ROBOTLASER1", problem) for line, problem in other_scanner.items()}
+        _check_broken(path, broken, len(odometry) + len(robotlaser1) + len(broken))
+        return _from_robotlaser1(path, odometry, list(robotlaser1.values()), len(broken), reach)
+    if not odometry and not flaser and not broken:
         advice = "name a CARMEN log; other formats have other readers"
         raise InputError("has neither FLASER nor ODOM lines", path=path, advice=advice)
-    total = len(wheels) + len(scans) + len(broken)
-    scans, odd = _same_size(scans)
-    broken |= odd
+    total = len(odometry) + len(flaser) + len(broken)
+    flaser, other_count = _with_usual_beam_count(flaser)
+    broken |= other_count
     _check_broken(path, broken, total)
-    if not scans:
+    if not flaser:
         problem = f"has no usable FLASER line among its {total} FLASER and ODOM lines"
         raise InputError(problem, path=path, advice="name a log that holds laser scans")
-    return _recording(path, wheels, scans, len(broken), reach)
+    return _from_flaser(path, odometry, flaser, len(broken), reach)
 
 
-def _odom(fields: list[bytes]) -> tuple[float, float, float, float]:
-    """Time and pose of an ODOM line; errors do not know the place."""
+def _parse_odom(fields: list[bytes]) -> _StampedPose:
+    """Time and pose of an ODOM line; errors carry no line number."""
     if len(fields) != 10:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of 10")
     names = ("field 8 (ipc_time)", "field 2 (x)", "field 3 (y)", "field 4 (theta)")
     return tuple(number(fields[i], name) for i, name in zip((7, 1, 2, 3), names, strict=True))
 
 
-def _flaser(fields: list[bytes]) -> tuple[tuple[float, float, float, float], np.ndarray]:
-    """Time and odometry pose of a FLASER line, and its ranges (n,) [m]; errors know no place."""
+def _parse_flaser(fields: list[bytes]) -> tuple[_StampedPose, np.ndarray]:
+    """Time and odometry pose of a FLASER line, and its ranges (n,) [m]; errors as above."""
     count = number(fields[1], "field 2 (n)") if len(fields) > 1 else 0.0
     if count < 2 or count != int(count):
-        raise InputError(f"{count:g} is no number of beams", field="field 2 (n)")
-    n = int(count)
-    extra = len(fields) - 2 - n
-    if extra in (0, 3):
+        raise InputError(f"{count:g} is not a beam count", field="field 2 (n)")
+    num_beams = int(count)
+    num_other = len(fields) - 2 - num_beams
+    if num_other in (0, 3):
         raise InputError("no odometry: the fields x y theta odom_x odom_y odom_theta are missing")
-    if extra != 9:
-        raise InputError(f"cut or damaged: {len(fields)} fields instead of {n + 11}")
+    if num_other != 9:
+        raise InputError(f"cut or damaged: {len(fields)} fields instead of {num_beams + 11}")
     names = ("ipc_time", "odom_x", "odom_y", "odom_theta")
-    places = (n + 8, n + 5, n + 6, n + 7)
-    stamped = tuple(
-        number(fields[i], f"field {i + 1} ({name})") for i, name in zip(places, names, strict=True)
+    columns = (num_beams + 8, num_beams + 5, num_beams + 6, num_beams + 7)
+    stamped_pose = tuple(
+        number(fields[i], f"field {i + 1} ({name})") for i, name in zip(columns, names, strict=True)
     )
-    return stamped, _ranges(fields[2 : 2 + n])
+    return stamped_pose, _parse_ranges(fields[2 : 2 + num_beams])
 
 
-def _ranges(fields: list[bytes]) -> np.ndarray:
-    """Readings (n,) float64 [m], some perhaps infinite; errors know no place."""
+def _parse_ranges(fields: list[bytes]) -> np.ndarray:
+    """Ranges (n,) float64 [m], perhaps infinite; errors carry no line number."""
     try:
         ranges = np.array([float(field) for field in fields])
     except ValueError:
@@ -120,90 +131,107 @@ def _ranges(fields: list[bytes]) -> np.ndarray:
     return ranges
 
 
-def _same_size(scans: list) -> tuple[list, dict]:
-    """Scans of the most frequent beam count, and what is wrong with the others by line."""
+def _with_usual_beam_count(scans: list[_FlaserScan]) -> tuple[list[_FlaserScan], _Broken]:
+    """Scans with the most frequent beam count, and the others as broken lines."""
     if not scans:
         return scans, {}
-    n = Counter(ranges.size for _, _, ranges in scans).most_common(1)[0][0]
-    odd = {
-        line: (b"FLASER", f"field 2 (n): beam count changes: {ranges.size} instead of {n}")
+    usual = Counter(ranges.size for _, _, ranges in scans).most_common(1)[0][0]
+    others = {
+        line: (b"FLASER", f"field 2 (n): beam count changes: {ranges.size} instead of {usual}")
         for line, _, ranges in scans
-        if ranges.size != n
+        if ranges.size != usual
     }
-    return [scan for scan in scans if scan[0] not in odd], odd
+    return [scan for scan in scans if scan[0] not in others], others
 
 
-def _check_broken(path: str | PathLike, broken: dict, total: int) -> None:
-    """Raise if more lines are broken than is tolerated."""
+def _check_broken(path: str | PathLike, broken: _Broken, total: int) -> None:
+    """Raise if more of `total` lines are broken than `TOLERATED` allows."""
     if len(broken) <= TOLERATED * total:
         return
     line = min(broken)
-    kind, reason = broken[line]
+    keyword, reason = broken[line]
     problem = f"{reason} ({len(broken)} of {total} lines of scans and odometry are broken)"
-    advice = f"repair them, each is: {_FORMS[kind]}"
+    advice = f"repair them, each is: {_FORMS[keyword]}"
     raise InputError(problem, path=path, line=line, advice=advice)
 
 
-def _recording(
-    path: str | PathLike, wheels: list, scans: list, skipped: int, reach: float
-) -> Recording:
-    """Stack the lines' values; readings that are no return become inf."""
-    stamped = np.array([stamp for _, stamp, _ in scans])  # (T, 4)
-    ranges = no_return(np.array([ranges for _, _, ranges in scans]), reach)
-    lidar = layout(ranges.shape[1], reach)
-    return _joined(path, wheels, stamped, ranges, lidar, skipped)
-
-
-def _newer(
-    path: str | PathLike, wheels: list, scans: list[Laser], skipped: int, reach: float
-) -> Recording:
-    """The same of ROBOTLASER1 lines."""
-    stamped = np.array([(one.time, *one.pose) for one in scans])
-    first = scans[0]
-    reach = min(reach, first.reach)
-    ranges = no_return(np.array([one.ranges for one in scans]), reach)
-    lidar = Lidar(ranges.shape[1], first.first, first.step, reach, NOISE)
-    return _joined(path, wheels, stamped, ranges, lidar, skipped)
-
-
-def _joined(
+def _from_flaser(
     path: str | PathLike,
-    wheels: list,
-    stamped: np.ndarray,
+    odometry: list[_StampedPose],
+    scans: list[_FlaserScan],
+    skipped: int,
+    range_max: float,
+) -> Recording:
+    """The log of FLASER lines."""
+    stamped_poses = np.array([stamped_pose for _, stamped_pose, _ in scans])
+    ranges = no_return(np.array([ranges for _, _, ranges in scans]), range_max)
+    lidar = layout(ranges.shape[1], range_max)
+    return _build_log(path, odometry, stamped_poses, ranges, lidar, skipped)
+
+
+def _from_robotlaser1(
+    path: str | PathLike,
+    odometry: list[_StampedPose],
+    scans: list[Laser],
+    skipped: int,
+    range_max: float,
+) -> Recording:
+    """The log of ROBOTLASER1 lines."""
+    stamped_poses = np.array([(scan.time, *scan.pose) for scan in scans])
+    first = scans[0]
+    range_max = min(range_max, first.reach)
+    ranges = no_return(np.array([scan.ranges for scan in scans]), range_max)
+    lidar = Lidar(ranges.shape[1], first.first, first.step, range_max, NOISE)
+    return _build_log(path, odometry, stamped_poses, ranges, lidar, skipped)
+
+
+def _build_log(
+    path: str | PathLike,
+    odometry: list[_StampedPose],
+    stamped_poses: np.ndarray,
     ranges: np.ndarray,
     lidar: Lidar,
     skipped: int,
 ) -> Recording:
-    """Scans (T, R) with their times and poses (T, 4), and the stream of the wheels."""
-    if len(stamped) > 1 and not np.ptp(stamped[:, 1:], axis=0).any():
-        problem = f"no odometry: its pose is the same in all {len(stamped)} scans"
+    """Combine scans and odometry, and repair the odometry where it restarts or was corrected.
+
+    Args:
+        path: The log, for errors.
+        odometry: Times and poses of the ODOM lines.
+        stamped_poses: (T, 4) times [s] and poses [m, m, rad] of the scans.
+        ranges: (T, R) float32 [m].
+        lidar: The scanner.
+        skipped: Number of broken lines.
+    """
+    if len(stamped_poses) > 1 and not np.ptp(stamped_poses[:, 1:], axis=0).any():
+        problem = f"no odometry: its pose is the same in all {len(stamped_poses)} scans"
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
-    stream = np.array(wheels) if wheels else stamped  # (N, 4)
-    times, wheel_times = stamped[:, 0].copy(), stream[:, 0].copy()
-    corrected = bool(wheels) and foreign(times, stamped[:, 1:], wheel_times, stream[:, 1:])
-    wheel_poses, restarts = without_jumps(wheel_times, stream[:, 1:].copy())
+    stream = np.array(odometry) if odometry else stamped_poses  # (N, 4)
+    times, odom_times = stamped_poses[:, 0].copy(), stream[:, 0].copy()
+    corrected = bool(odometry) and foreign(times, stamped_poses[:, 1:], odom_times, stream[:, 1:])
+    odom_poses, restarts = without_jumps(odom_times, stream[:, 1:].copy())
     if restarts > TOLERATED * len(stream):
         problem = f"its odometry jumps {restarts} times in {len(stream)} lines"
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
-    mended = []
+    repairs = []
     if restarts:
-        mended.append(f"odometry starts anew ({restarts} x): the robot stands still there")
+        repairs.append(f"odometry restarts ({restarts} x): no motion is assumed there")
     if corrected:
-        mended.append("poses of the scans are not those of the wheels: ODOM lines are used instead")
-    odometry = stamped[:, 1:].copy()
-    if wheels and mended:
-        odometry = interpolate(times, *by_time(wheel_times, wheel_poses))
-    elif not wheels:
-        odometry = wheel_poses.copy()
+        repairs.append("poses of the scans are not odometry: ODOM lines are used instead")
+    scan_poses = stamped_poses[:, 1:].copy()
+    if odometry and repairs:
+        scan_poses = interpolate(times, *by_time(odom_times, odom_poses))
+    elif not odometry:
+        scan_poses = odom_poses.copy()
     return Recording(
         times=times,
-        odometry=odometry,
+        odometry=scan_poses,
         ranges=ranges,
         lidar=lidar,
         skipped=skipped,
-        wheel_times=wheel_times,
-        wheel_poses=wheel_poses,
-        mended=tuple(mended),
+        wheel_times=odom_times,
+        wheel_poses=odom_poses,
+        mended=tuple(repairs),
     )
 
 
@@ -212,7 +240,7 @@ def layout(beams: int, reach: float) -> Lidar:
 
     Args:
         beams: Number of beams, at least 2.
-        reach: Range [m] beyond which nothing returns.
+        reach: Range [m] from which on a reading counts as no return.
     """
-    steps = beams - 1 if beams % 2 else beams
-    return Lidar(beams, -math.pi / 2, math.pi / steps, float(reach), NOISE)
+    intervals = beams - 1 if beams % 2 else beams
+    return Lidar(beams, -math.pi / 2, math.pi / intervals, float(reach), NOISE)

@@ -1,4 +1,4 @@
-"""A long computation's state in a file, so that it can go on after any stop."""
+"""Checkpoints: the state of a long computation in a file, to resume it after an interruption."""
 
 import json
 from collections.abc import Mapping
@@ -16,48 +16,49 @@ ABOUT = "about"
 
 
 def write(path: str | PathLike, state: Any, about: Mapping[str, Any]) -> None:
-    """Keep a state; the file is replaced as a whole, so that one of them is always there.
+    """Save a state; the file is replaced atomically, so a complete one always exists.
 
     Args:
         path: File to write (NumPy's .npz).
-        state: Records of arrays, nested at will.
-        about: What the state belongs to: all that must be the same for it to go on.
+        state: Pytree of arrays.
+        about: Settings of the computation: all that must be equal for it to be resumed.
 
     Raises:
         InputError: The file cannot be written.
     """
-    leaves = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+    leaves = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
+    arrays = {ABOUT: np.asarray(json.dumps(plain(about)))} | leaves
     with replace(path) as file:
-        np.savez(file, **{ABOUT: json.dumps(plain(about))}, **leaves)
+        np.savez(file, **arrays)
 
 
 def read(path: str | PathLike, template: Tree, about: Mapping[str, Any]) -> Tree:
-    """Read a state that `write` kept.
+    """Read a state that `write` saved.
 
     Args:
         path: The file.
-        template: A state with the same records, shapes and dtypes.
-        about: What it is to belong to.
+        template: A state with the same structure, shapes and dtypes.
+        about: Settings that the saved ones must be equal to.
 
     Raises:
-        InputError: The file cannot be read, is no such file, or belongs to something else.
+        InputError: The file cannot be read, is no checkpoint, or has other settings or shapes.
     """
-    advice = "remove it to begin anew, or name another folder by --out"
+    advice = "remove it to start again, or name another folder by --out"
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            found = json.loads(str(file[ABOUT]))
+            saved = json.loads(str(file[ABOUT]))
             leaves = [file[f"leaf{i}"] for i in range(len(file.files) - 1)]
-    except Exception as error:  # NumPy, zipfile and json list nowhere what damage raises
+    except Exception as error:  # NumPy, zipfile and json do not document what damage raises
         problem = f"is no checkpoint ({type(error).__name__})"
         raise InputError(problem, path=path, advice=advice) from None
-    wanted = plain(about)
-    for name in sorted(wanted.keys() | (found.keys() if isinstance(found, dict) else set())):
-        if not isinstance(found, dict) or found.get(name) != wanted.get(name):
+    expected = plain(about)
+    for name in sorted(expected.keys() | (saved.keys() if isinstance(saved, dict) else set())):
+        if not isinstance(saved, dict) or saved.get(name) != expected.get(name):
             raise InputError("belongs to another run", path=path, field=name, advice=advice)
-    own, structure = jax.tree.flatten(template)
-    same = len(own) == len(leaves) and all(
-        np.shape(a) == b.shape and np.asarray(a).dtype == b.dtype
-        for a, b in zip(own, leaves, strict=True)
+    template_leaves, structure = jax.tree.flatten(template)
+    same = len(template_leaves) == len(leaves) and all(
+        np.shape(wanted) == found.shape and np.asarray(wanted).dtype == found.dtype
+        for wanted, found in zip(template_leaves, leaves, strict=True)
     )
     if not same:
         raise InputError("belongs to another run (its shapes)", path=path, advice=advice)

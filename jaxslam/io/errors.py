@@ -1,10 +1,10 @@
-"""The one error that bad input raises."""
+"""The exception for bad input."""
 
 from os import PathLike
 
 
 class InputError(ValueError):
-    """Bad input, told in one line: where (file, line, field), what is wrong, what to do."""
+    """Bad input, in one line: location (file, line, field), problem, advice."""
 
     def __init__(
         self,
@@ -15,17 +15,17 @@ class InputError(ValueError):
         field: str | None = None,
         advice: str | None = None,
     ):
-        """Put the line together.
+        """Build the message `path:line: field: problem; advice`.
 
         Args:
             problem: What is wrong.
             path: File or folder that holds it.
             line: Its line in the file, counted from 1.
-            field: Its field in the line or record.
-            advice: What to do about it.
+            field: Its field in the line or record, or the command line option.
+            advice: How to fix it.
         """
-        place = "" if path is None else str(path)
-        place += "" if line is None else f":{line}"
-        text = ": ".join(part for part in (place, field, problem) if part)
+        location = "" if path is None else str(path)
+        location += "" if line is None else f":{line}"
+        text = ": ".join(part for part in (location, field, problem) if part)
         text += "" if advice is None else f"; {advice}"
         super().__init__(" ".join(text.splitlines()))

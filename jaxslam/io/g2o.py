@@ -1,11 +1,11 @@
-"""Pose graphs in the form of g2o that hold the laser scans of their poses, as recordings.
+"""Pose graphs in the format of g2o that also hold the laser scan of each pose, read as logs.
 
     VERTEX_SE2 id x y theta
     ROBOTLASER1 ... (`robotlaser`)
     EDGE_SE2 from to x y theta (6 numbers of the information matrix)
 
-A scan belongs to the vertex before it. Edges from one vertex to the next one in the file are the
-odometry; all others are left to whoever closes loops. Places of the vertices are not used.
+A scan belongs to the vertex before it. Edges from a vertex to the next one in the file are the
+odometry; all other edges (loop closures) and the poses of the vertices are ignored.
 """
 
 import math
@@ -34,61 +34,61 @@ def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
 
     Args:
         path: The file.
-        reach: Range [m] from which on a reading counts as no return, if the scans do not name a
-            smaller one; so does one <= 0.
+        reach: Range [m] from which on a reading counts as no return, unless the range_max of the
+            scans is smaller; so does one <= 0.
 
     Raises:
         InputError: The file cannot be read, has no scan or no odometry from one vertex to the
             next, a vertex or edge is broken, or more than 5 % of the scans.
     """
     if not 0.0 < reach < math.inf:
-        raise InputError(f"reach {reach} m", advice="give a positive number of metres")
-    order: list[int] = []  # names of the vertices as they come
+        raise InputError(f"range_max {reach} m", advice="give a positive number of metres")
+    vertices: list[int] = []  # ids in file order
     scans: dict[int, Laser] = {}
     edges: dict[tuple[int, int], tuple[float, ...]] = {}
     broken: dict[int, str] = {}
     for line, text in lines(path):
         fields = text.split()
-        kind = fields[0] if fields else b""
-        if kind not in _FORMS:
+        keyword = fields[0] if fields else b""
+        if keyword not in _FORMS:
             continue
         try:
-            if kind == b"VERTEX_SE2":
-                order.append(_name(fields, 5, 1))
-            elif kind == b"EDGE_SE2":
-                pair = _name(fields, 12, 1), _name(fields, 12, 2)
-                edges.setdefault(pair, tuple(number(x, "x y theta") for x in fields[3:6]))
-            elif order:
-                scans.setdefault(order[-1], robotlaser.parse(line, fields))
+            if keyword == b"VERTEX_SE2":
+                vertices.append(_vertex_id(fields, 5, 1))
+            elif keyword == b"EDGE_SE2":
+                pair = _vertex_id(fields, 12, 1), _vertex_id(fields, 12, 2)
+                edges.setdefault(pair, tuple(number(field, "x y theta") for field in fields[3:6]))
+            elif vertices:
+                scans.setdefault(vertices[-1], robotlaser.parse(line, fields))
         except InputError as error:
-            if kind != b"ROBOTLASER1":
-                advice = f"repair it, it is: {_FORMS[kind]}"
+            if keyword != b"ROBOTLASER1":
+                advice = f"repair it, it is: {_FORMS[keyword]}"
                 raise InputError(str(error), path=path, line=line, advice=advice) from None
             broken[line] = str(error)
-    if not order:
+    if not vertices:
         advice = "name a pose graph of g2o; other formats have other readers"
         raise InputError("has no VERTEX_SE2 lines", path=path, advice=advice)
-    if len(set(order)) < len(order):
-        twice = Counter(order).most_common(1)[0][0]
-        raise InputError(f"vertex {twice} comes twice", path=path, advice="number them anew")
-    scans, odd = robotlaser.alike(scans)
-    broken |= odd
-    _check(path, scans, broken)
-    return _recording(path, order, scans, edges, len(broken), reach)
+    if len(set(vertices)) < len(vertices):
+        duplicate = Counter(vertices).most_common(1)[0][0]
+        raise InputError(f"vertex {duplicate} occurs twice", path=path, advice="renumber them")
+    scans, other_scanner = robotlaser.alike(scans)
+    broken |= other_scanner
+    _check_scans(path, scans, broken)
+    return _build_log(path, vertices, scans, edges, len(broken), reach)
 
 
-def _name(fields: list[bytes], count: int, at: int) -> int:
-    """Number of a vertex; errors do not know the place."""
+def _vertex_id(fields: list[bytes], count: int, index: int) -> int:
+    """Id of a vertex in a line of `count` fields; errors carry no line number."""
     if len(fields) != count:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of {count}")
-    value = number(fields[at], f"field {at + 1}")
+    value = number(fields[index], f"field {index + 1}")
     if value != int(value):
-        raise InputError(f"{value:g} is no whole number", field=f"field {at + 1}")
+        raise InputError(f"{value:g} is not an integer", field=f"field {index + 1}")
     return int(value)
 
 
-def _check(path: str | PathLike, scans: dict[int, Laser], broken: dict[int, str]) -> None:
-    """Raise if there are no scans, or more are broken than is tolerated."""
+def _check_scans(path: str | PathLike, scans: dict[int, Laser], broken: dict[int, str]) -> None:
+    """Raise if there are no scans, or more are broken than `TOLERATED` allows."""
     total = len(scans) + len(broken)
     if not total:
         advice = "name a graph that holds its laser scans"
@@ -100,35 +100,35 @@ def _check(path: str | PathLike, scans: dict[int, Laser], broken: dict[int, str]
         raise InputError(problem, path=path, line=line, advice=advice)
 
 
-def _recording(
+def _build_log(
     path: str | PathLike,
-    order: list[int],
+    vertices: list[int],
     scans: dict[int, Laser],
     edges: dict[tuple[int, int], tuple[float, ...]],
     skipped: int,
-    reach: float,
+    range_max: float,
 ) -> Recording:
-    """Put scans and odometry together."""
-    pairs = list(zip(order[:-1], order[1:], strict=True))
+    """Chain the odometry edges to poses, and keep those of vertices with a scan."""
+    pairs = list(zip(vertices[:-1], vertices[1:], strict=True))
     for pair in pairs:
         if pair not in edges:
             problem = f"no EDGE_SE2 from vertex {pair[0]} to the next, {pair[1]}"
             raise InputError(problem, path=path, advice="name a graph with its odometry")
-    moves = np.array([edges[pair] for pair in pairs]).reshape(-1, 3)
-    poses = chain(moves)
-    with_scan = np.array([name in scans for name in order])
-    kept = [scans[name] for name in order if name in scans]
+    increments = np.array([edges[pair] for pair in pairs]).reshape(-1, 3)
+    poses = chain(increments)
+    has_scan = np.array([vertex in scans for vertex in vertices])
+    kept = [scans[vertex] for vertex in vertices if vertex in scans]
     first = kept[0]
-    reach = min(reach, first.reach)
-    ranges = no_return(np.array([one.ranges for one in kept]), reach)
-    times = np.array([one.time for one in kept])
-    odometry = poses[with_scan]
+    range_max = min(range_max, first.reach)
+    ranges = no_return(np.array([scan.ranges for scan in kept]), range_max)
+    times = np.array([scan.time for scan in kept])
+    scan_poses = poses[has_scan]
     return Recording(
         times=times,
-        odometry=odometry,
+        odometry=scan_poses,
         ranges=ranges,
-        lidar=Lidar(ranges.shape[1], first.first, first.step, reach, NOISE),
+        lidar=Lidar(ranges.shape[1], first.first, first.step, range_max, NOISE),
         skipped=skipped,
         wheel_times=times,
-        wheel_poses=odometry,
+        wheel_poses=scan_poses,
     )

@@ -1,6 +1,7 @@
 """Topological maps as GraphML, for networkx, igraph, Gephi; needs the extra `[graph]`."""
 
 import math
+from collections.abc import Mapping
 from importlib.util import find_spec
 from os import PathLike
 from typing import Any
@@ -23,10 +24,10 @@ def write(path: str | PathLike, graph: Graph) -> None:
     """Write a map as an undirected multigraph.
 
     Nodes have `x`, `y` and `clearance`, edges `length` and `clearance`, all [m], and `line`, the
-    polyline in well-known text from `source` to `target`. What is not finite is left out.
+    polyline in well-known text from `source` to `target`. Values that are not finite are left out.
 
     Args:
-        path: File to write, all of it or nothing.
+        path: File to write, atomically.
         graph: The map.
 
     Raises:
@@ -35,21 +36,23 @@ def write(path: str | PathLike, graph: Graph) -> None:
     require()
     import networkx
 
-    net = networkx.MultiGraph()
-    for id, (x, y), clearance in zip(graph.id, graph.xy, graph.clearance, strict=True):
-        net.add_node(int(id), x=float(x), y=float(y), **_finite(clearance=clearance))
-    for k, (a, b) in enumerate(graph.pairs):
-        numbers = _finite(length=graph.length[k], clearance=graph.arc_clearance[k])
-        ends = int(graph.id[a]), int(graph.id[b])
-        net.add_edge(*ends, key=k, line=_text(graph.lines[k]), **numbers)
-    write_text(path, "\n".join(networkx.generate_graphml(net)) + "\n")
+    multigraph = networkx.MultiGraph()
+    for node, (x, y), clearance in zip(graph.id, graph.xy, graph.clearance, strict=True):
+        attributes = {"x": float(x), "y": float(y)} | _finite({"clearance": clearance})
+        multigraph.add_nodes_from([(int(node), attributes)])
+    for index, (start, end) in enumerate(graph.pairs):
+        numbers = {"length": graph.length[index], "clearance": graph.arc_clearance[index]}
+        attributes = {"line": _well_known_text(graph.lines[index])} | _finite(numbers)
+        source, target = int(graph.id[start]), int(graph.id[end])
+        multigraph.add_edges_from([(source, target, index, attributes)])
+    write_text(path, "\n".join(networkx.generate_graphml(multigraph)) + "\n")
 
 
-def _finite(**values: Any) -> dict[str, float]:
+def _finite(values: Mapping[str, Any]) -> dict[str, float]:
     """Those of the values that are finite."""
     return {name: float(value) for name, value in values.items() if math.isfinite(value)}
 
 
-def _text(line: np.ndarray) -> str:
+def _well_known_text(line: np.ndarray) -> str:
     """A polyline (n, 2) as well-known text."""
     return "LINESTRING (" + ", ".join(f"{x!r} {y!r}" for x, y in line.tolist()) + ")"

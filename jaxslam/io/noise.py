@@ -1,4 +1,4 @@
-"""The filter's noise parameters in a file, `noise.json`.
+"""The noise parameters of the filter (Q and R) in a file, `noise.json`.
 
 {"format": "jaxslam-noise", "version": 1, "noise": {field: number or list}}
 """
@@ -24,16 +24,16 @@ def write(path: str | PathLike, noise: Noise) -> None:
     """Write a record of noise parameters.
 
     Args:
-        path: File to write, all of it or nothing.
-        noise: NamedTuple of arrays, finite and positive, or None for what is left out.
+        path: File to write, atomically.
+        noise: NamedTuple of arrays, finite and positive; fields that are None are left out.
 
     Raises:
         InputError: A value is not finite and positive, or the file cannot be written.
     """
-    known = {name: value for name, value in noise._asdict().items() if value is not None}
-    for name, value in known.items():
+    fields = {name: value for name, value in noise._asdict().items() if value is not None}
+    for name, value in fields.items():
         _check_values(path, name, np.asarray(value, np.float64))
-    write_json(path, {"format": FORMAT, "version": VERSION, "noise": known})
+    write_json(path, {"format": FORMAT, "version": VERSION, "noise": fields})
 
 
 def read(path: str | PathLike, template: Noise) -> Noise:
@@ -41,8 +41,8 @@ def read(path: str | PathLike, template: Noise) -> Noise:
 
     Args:
         path: File that `write` wrote.
-        template: Record with the fields, shapes and dtypes to expect; what is None there may be in
-            the file, and stays None.
+        template: Record with the expected fields, shapes and dtypes; a field that is None may be
+            in the file, and stays None.
 
     Returns:
         A record of the template's type.
@@ -56,12 +56,12 @@ def read(path: str | PathLike, template: Noise) -> Noise:
     for name in fields.keys() - expected.keys():
         advice = f"the fields are {', '.join(expected)}"
         raise InputError("unknown field", path=path, field=name, advice=advice)
-    expected = {name: like for name, like in expected.items() if like is not None}
-    for name in expected:
-        if name not in fields:
+    for name, like in expected.items():
+        if like is not None and name not in fields:
             raise InputError("missing", path=path, field=name, advice="add it, or tune again")
-    return template._replace(
-        **{name: _field(path, name, fields[name], like) for name, like in expected.items()}
+    return template._make(
+        None if like is None else _parse_field(path, name, fields[name], like)
+        for name, like in expected.items()
     )
 
 
@@ -85,7 +85,7 @@ def _load(path: str | PathLike) -> dict[str, Any]:
     return content["noise"]
 
 
-def _field(path: str | PathLike, name: str, value: Any, like: Any) -> Any:
+def _parse_field(path: str | PathLike, name: str, value: Any, like: Any) -> Any:
     """One field as an array of the shape and dtype of `like`."""
     like = np.asarray(like)
     form = "a number" if like.shape == () else f"numbers of shape {like.shape}"
@@ -100,7 +100,7 @@ def _field(path: str | PathLike, name: str, value: Any, like: Any) -> Any:
 
 
 def _check_values(path: str | PathLike, name: str, array: np.ndarray) -> None:
-    """Raise unless all is finite and positive."""
+    """Raise unless all values are finite and positive."""
     if not (np.isfinite(array) & (array > 0.0)).all():
         advice = "standard deviations are finite and above 0"
         raise InputError(f"{array.tolist()} is not positive", path=path, field=name, advice=advice)

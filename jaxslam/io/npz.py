@@ -1,19 +1,25 @@
-"""Recordings as NumPy files, for scanners that no other reader knows.
+"""Laser logs as NumPy files, for scanners that no other reader supports.
 
     np.savez(path, format="jaxslam-recording", version=1, times=..., odometry=..., ranges=...,
              first=..., step=..., reach=...)
 
-`times` (T,) [s]; `odometry` (T, 3) [m, m, rad] pose that the wheels report at each scan; `ranges`
-(T, R) [m], where what is infinite, NaN, not above zero or not below `reach` [m] returned nothing;
-beam k looks along `first + k step` [rad] from straight ahead, to the left. Also, where they are
-known: `noise` [m] of a range, and the whole stream of wheel poses, `wheel_times` (N,) and
-`wheel_poses` (N, 3).
+| array | shape, unit | meaning |
+|---|---|---|
+| `times` | (T,) [s] | time of each scan |
+| `odometry` | (T, 3) [m, m, rad] | pose by odometry at each scan |
+| `ranges` | (T, R) [m] | no return where infinite, NaN, not above zero or not below `reach` |
+| `first` | () [rad] | `angle_min`: direction of beam 0, counter-clockwise from straight ahead |
+| `step` | () [rad] | `angle_increment`: beam k has the direction `first + k step` |
+| `reach` | () [m] | `range_max` |
+| `noise` | () [m] | standard deviation of a range; optional |
+| `wheel_times` | (N,) [s] | times of the whole odometry stream; optional |
+| `wheel_poses` | (N, 3) [m, m, rad] | its poses; optional |
 """
 
 import math
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,79 +29,83 @@ from jaxslam.io.recording import NOISE, Recording, no_return
 from jaxslam.lidar import Lidar
 
 FORMAT, VERSION = "jaxslam-recording", 1
-_NEEDED = ("format", "version", "times", "odometry", "ranges", "first", "step", "reach")
-_MAY = ("noise", "wheel_times", "wheel_poses")
-_ADVICE = f"it is a NumPy file with {', '.join(_NEEDED)}"
+_REQUIRED = ("format", "version", "times", "odometry", "ranges", "first", "step", "reach")
+_OPTIONAL = ("noise", "wheel_times", "wheel_poses")
+_LIMITS = {"step": (1e-6, math.pi), "reach": (1e-3, 1e6), "noise": (1e-6, 1e3)}
+_ADVICE = f"it is a NumPy file with {', '.join(_REQUIRED)}"
 
 
 def write(path: str | PathLike, recording: Recording) -> None:
-    """Write a recording.
+    """Write a laser log.
 
     Raises:
         InputError: The file cannot be written.
     """
     lidar = recording.lidar
-    arrays = {name: getattr(recording, name) for name in ("times", "odometry", "ranges")}
-    arrays |= {"wheel_times": recording.wheel_times, "wheel_poses": recording.wheel_poses}
-    scanner = {name: getattr(lidar, name) for name in ("first", "step", "reach", "noise")}
     with replace(Path(path)) as file:
-        np.savez_compressed(file, format=FORMAT, version=VERSION, **arrays, **scanner)
+        np.savez_compressed(
+            file,
+            format=FORMAT,
+            version=VERSION,
+            times=recording.times,
+            odometry=recording.odometry,
+            ranges=recording.ranges,
+            wheel_times=recording.wheel_times,
+            wheel_poses=recording.wheel_poses,
+            first=lidar.first,
+            step=lidar.step,
+            reach=lidar.reach,
+            noise=lidar.noise,
+        )
 
 
 def read(path: str | PathLike, *, reach: float = math.inf) -> Recording:
-    """Read a recording.
+    """Read a laser log.
 
     Args:
         path: The file.
-        reach: Range [m] from which on a reading counts as no return, if the file's is not smaller.
+        reach: Range [m] from which on a reading counts as no return, unless the file's `reach` is
+            smaller.
 
     Raises:
         InputError: The file cannot be read, lacks an array, has an unknown one, or one of a wrong
             shape or with values out of range.
     """
-    given = _load(path)
-    for name in sorted(given.keys() - {*_NEEDED, *_MAY}):
+    arrays = _load(path)
+    for name in sorted(arrays.keys() - {*_REQUIRED, *_OPTIONAL}):
         raise InputError("unknown array", path=path, field=name, advice=_ADVICE)
-    for name in _NEEDED:
-        if name not in given:
+    for name in _REQUIRED:
+        if name not in arrays:
             raise InputError("missing", path=path, field=name, advice=_ADVICE)
-    if str(given["format"]) != FORMAT or str(given["version"]) != str(VERSION):
-        problem = f"is {given['format']} {given['version']}, not {FORMAT} {VERSION}"
+    if str(arrays["format"]) != FORMAT or str(arrays["version"]) != str(VERSION):
+        problem = f"is {arrays['format']} {arrays['version']}, not {FORMAT} {VERSION}"
         raise InputError(problem, path=path, field="format", advice=_ADVICE)
 
-    times = _array(path, given, "times", (None,))
+    times = _array(path, arrays, "times", (None,))
     count = len(times)
-    odometry = _array(path, given, "odometry", (count, 3))
-    ranges = _array(path, given, "ranges", (count, None), finite=False)
+    odometry = _array(path, arrays, "odometry", (count, 3))
+    ranges = _array(path, arrays, "ranges", (count, None), finite=False)
     if not count or ranges.shape[1] < 2:
         advice = "give one scan at least, of two beams at least"
         raise InputError(f"has the shape {ranges.shape}", path=path, field="ranges", advice=advice)
-    positive = {"step": (1e-6, math.pi), "reach": (1e-3, 1e6), "noise": (1e-6, 1e3)}
-    scanner = {"noise": NOISE, "first": float(_array(path, given, "first", ()))}
-    for name, (low, high) in positive.items():
-        if name in given:
-            value = scanner[name] = float(_array(path, given, name, ()))
-            if not low <= value <= high:
-                problem = f"{value:g} is not between {low:g} and {high:g}"
-                raise InputError(problem, path=path, field=name, advice=_ADVICE)
-    scanner["reach"] = min(scanner["reach"], reach)
-
-    stream = {"wheel_times": times, "wheel_poses": odometry}
-    if stream.keys() & given.keys():
-        for name, shape in (("wheel_times", (None,)), ("wheel_poses", (None, 3))):
-            if name not in given:
-                raise InputError("missing", path=path, field=name, advice="give both or neither")
-            stream[name] = _array(path, given, name, shape)
-        if len(stream["wheel_times"]) != len(stream["wheel_poses"]):
-            problem = "has another length than wheel_times"
-            raise InputError(problem, path=path, field="wheel_poses", advice=_ADVICE)
+    lidar = Lidar(
+        ranges.shape[1],
+        float(_array(path, arrays, "first", ())),
+        _number(path, arrays, "step"),
+        min(_number(path, arrays, "reach"), reach),
+        _number(path, arrays, "noise") if "noise" in arrays else NOISE,
+    )
+    wheel_times, wheel_poses = times, odometry
+    if "wheel_times" in arrays or "wheel_poses" in arrays:
+        wheel_times, wheel_poses = _odometry_stream(path, arrays)
     return Recording(
         times=times,
         odometry=odometry,
-        ranges=no_return(ranges, scanner["reach"]),
-        lidar=Lidar(ranges.shape[1], **scanner),
+        ranges=no_return(ranges, lidar.reach),
+        lidar=lidar,
         skipped=0,
-        **stream,
+        wheel_times=wheel_times,
+        wheel_poses=wheel_poses,
     )
 
 
@@ -108,29 +118,54 @@ def _load(path: str | PathLike) -> dict[str, np.ndarray]:
         raise InputError("does not exist", path=path, advice="check the name") from None
     except IsADirectoryError:
         raise InputError("is a folder", path=path, advice="name a file inside it") from None
-    except Exception as error:  # NumPy and zipfile list nowhere what damage raises
+    except Exception as error:  # NumPy and zipfile do not document what damage raises
         problem = f"is no NumPy file that can be read ({type(error).__name__})"
         raise InputError(problem, path=path, advice=_ADVICE) from None
 
 
 def _array(
     path: str | PathLike,
-    given: dict[str, Any],
+    arrays: Mapping[str, np.ndarray],
     name: str,
     shape: tuple[int | None, ...],
     *,
     finite: bool = True,
 ) -> np.ndarray:
-    """An array as float64, of this shape: any number where None."""
-    found = np.asarray(given[name])
-    fits = found.ndim == len(shape) and all(
-        have == want or want is None for have, want in zip(found.shape, shape, strict=True)
+    """An array as float64, checked to have this shape, in which None stands for any size."""
+    array = np.asarray(arrays[name])
+    fits = array.ndim == len(shape) and all(
+        size == wanted or wanted is None for size, wanted in zip(array.shape, shape, strict=True)
     )
-    if found.dtype.kind not in "fiu" or not fits:
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-        problem = f"is {found.dtype} {found.shape}, not numbers {wanted}"
+    if array.dtype.kind not in "fiu" or not fits:
+        wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
+        problem = f"is {array.dtype} {array.shape}, not numbers {wanted}"
         raise InputError(problem, path=path, field=name, advice=_ADVICE)
-    found = found.astype(np.float64)
-    if finite and not np.isfinite(found).all():
+    array = array.astype(np.float64)
+    if finite and not np.isfinite(array).all():
         raise InputError("holds NaN or infinity", path=path, field=name, advice=_ADVICE)
-    return found
+    return array
+
+
+def _number(path: str | PathLike, arrays: Mapping[str, np.ndarray], name: str) -> float:
+    """A number within its `_LIMITS`."""
+    low, high = _LIMITS[name]
+    value = float(_array(path, arrays, name, ()))
+    if not low <= value <= high:
+        problem = f"{value:g} is not between {low:g} and {high:g}"
+        raise InputError(problem, path=path, field=name, advice=_ADVICE)
+    return value
+
+
+def _odometry_stream(
+    path: str | PathLike, arrays: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) and poses (N, 3) of the odometry stream."""
+    for name in ("wheel_times", "wheel_poses"):
+        if name not in arrays:
+            raise InputError("missing", path=path, field=name, advice="give both or neither")
+    times = _array(path, arrays, "wheel_times", (None,))
+    poses = _array(path, arrays, "wheel_poses", (None, 3))
+    if len(times) != len(poses):
+        problem = "has another length than wheel_times"
+        raise InputError(problem, path=path, field="wheel_poses", advice=_ADVICE)
+    return times, poses

@@ -1,6 +1,6 @@
-"""Occupancy maps of ROS: a map_server YAML file and its image.
+"""ROS occupancy grids: a map_server YAML file and its image.
 
-To read the YAML needs the extra `[ros]`; images are read by Pillow, which matplotlib brings along.
+Reading the YAML needs the extra `[ros]`; images are read by Pillow, which matplotlib installs.
 """
 
 import math
@@ -24,26 +24,32 @@ FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_th
 
 
 class Occupancy(NamedTuple):
-    """A map of H x W cells; cell [i, j] covers a square, i grows with x, j with y.
+    """An occupancy grid of H x W square cells [i, j]; i grows with x, j with y.
 
-    Where both are False the cell is unknown.
+    A cell that is neither occupied nor free is unknown.
+
+    Attributes:
+        occupied: (H, W) bool.
+        free: (H, W) bool.
+        resolution: [m] side of a cell.
+        origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
     """
 
-    occupied: np.ndarray  # (H, W) bool
-    free: np.ndarray  # (H, W) bool
-    resolution: float  # [m] side of a cell
-    origin: np.ndarray  # (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame
+    occupied: np.ndarray
+    free: np.ndarray
+    resolution: float
+    origin: np.ndarray
 
 
 def read(path: str | PathLike) -> Occupancy:
     """Read a map.
 
-    A cell whose shade exceeds `occupied_thresh` is occupied, one below `free_thresh` free, as
-    map_server has it; transparent pixels are unknown. The modes trinary and scale differ only in
-    what lies between, which is unknown here.
+    As in map_server, a cell whose occupancy probability exceeds `occupied_thresh` is occupied, one
+    below `free_thresh` is free. Transparent pixels are unknown. The modes trinary and scale differ
+    only in the values between the thresholds, which are unknown here.
 
     Args:
-        path: YAML file with the fields in `FIELDS`, and perhaps `mode`.
+        path: YAML file with the fields in `FIELDS`, and optionally `mode`.
 
     Raises:
         InputError: PyYAML is not installed; the file is no YAML or lacks a field; a field is of
@@ -60,33 +66,32 @@ def read(path: str | PathLike) -> Occupancy:
             raise InputError("missing", path=path, field=name, advice="add it")
     resolution = _number(path, "resolution", fields["resolution"])
     if resolution <= 0.0:
-        advice = "give the side of a cell in metres"
-        raise InputError(
-            f"{resolution} is not positive", path=path, field="resolution", advice=advice
-        )
+        problem, advice = f"{resolution} is not positive", "give the side of a cell in metres"
+        raise InputError(problem, path=path, field="resolution", advice=advice)
     origin = fields["origin"]
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError("is not a list of three numbers", path=path, field="origin")
     origin = np.array([_number(path, "origin", value) for value in origin])
     negate = fields["negate"]
     if not isinstance(negate, int) or negate not in (0, 1):
-        raise InputError(f"{_shown(negate)} is neither 0 nor 1", path=path, field="negate")
+        raise InputError(f"{_excerpt(negate)} is neither 0 nor 1", path=path, field="negate")
     mode = fields.get("mode", "trinary")
     if mode not in MODES:
         advice = f"the modes are {', '.join(MODES)}"
-        raise InputError(f"unknown mode {_shown(mode)}", path=path, field="mode", advice=advice)
-    low, high = (_number(path, name, fields[name]) for name in ("free_thresh", "occupied_thresh"))
-    for name, value in (("free_thresh", low), ("occupied_thresh", high)):
+        raise InputError(f"unknown mode {_excerpt(mode)}", path=path, field="mode", advice=advice)
+    free_below = _number(path, "free_thresh", fields["free_thresh"])
+    occupied_above = _number(path, "occupied_thresh", fields["occupied_thresh"])
+    for name, value in (("free_thresh", free_below), ("occupied_thresh", occupied_above)):
         if not 0.0 <= value <= 1.0:
             raise InputError(f"{value} is not between 0 and 1", path=path, field=name)
-    if low >= high:
-        problem = f"{low} is not below the occupied_thresh of {high}"
+    if free_below >= occupied_above:
+        problem = f"{free_below} is not below the occupied_thresh of {occupied_above}"
         raise InputError(problem, path=path, field="free_thresh")
-    shade, known = _image(_image_path(path, fields["image"]))
-    chance = _chance(shade, mode, bool(negate))
-    known &= np.isfinite(chance)
-    turned = lambda cells: np.ascontiguousarray(cells[::-1].T)  # rows of an image go down
-    occupied, free = turned(known & (chance > high)), turned(known & (chance < low))
+    shade, known = _read_image(_image_path(path, fields["image"]))
+    probability = _occupancy_probability(shade, mode, bool(negate))
+    known &= np.isfinite(probability)
+    occupied = _image_to_grid(known & (probability > occupied_above))
+    free = _image_to_grid(known & (probability < free_below))
     return Occupancy(occupied, free, resolution, origin)
 
 
@@ -94,7 +99,7 @@ def write(path: str | PathLike, occupancy: Occupancy) -> None:
     """Write a map: the YAML file and, beside it, its image of the same name.
 
     Args:
-        path: YAML file to write, all of it or nothing, after the image.
+        path: YAML file to write, atomically, after the image.
         occupancy: The map.
 
     Raises:
@@ -106,21 +111,26 @@ def write(path: str | PathLike, occupancy: Occupancy) -> None:
     image = path.with_suffix(".pgm")
     with replace(image) as file:
         file.write(b"P5\n%d %d\n255\n" % rows.shape[::-1] + rows.tobytes())
-    x, y, turn = (float(value) for value in occupancy.origin)
+    x, y, heading = (float(value) for value in occupancy.origin)
     fields = {
         "image": image.name,
         "mode": "trinary",
         "resolution": f"{occupancy.resolution!r}",
-        "origin": f"[{x!r}, {y!r}, {turn!r}]",
+        "origin": f"[{x!r}, {y!r}, {heading!r}]",
         "negate": "0",
         "occupied_thresh": "0.65",
-        "free_thresh": "0.196",  # the shade 205 of unknown cells lies just above
+        "free_thresh": "0.196",  # the shade 205 of unknown cells is just above
     }
     write_text(path, "".join(f"{name}: {value}\n" for name, value in fields.items()))
 
 
-def _chance(shade: np.ndarray, mode: str, negate: bool) -> np.ndarray:
-    """Chance (H, W) that a cell is occupied, of its shade in 0..1; NaN where it is unknown."""
+def _image_to_grid(pixels: np.ndarray) -> np.ndarray:
+    """Cells [x, y] of pixels [row, column], whose rows go down."""
+    return np.ascontiguousarray(pixels[::-1].T)
+
+
+def _occupancy_probability(shade: np.ndarray, mode: str, negate: bool) -> np.ndarray:
+    """Probability (H, W) that a cell is occupied, from its shade in 0..1; NaN where unknown."""
     if mode != "raw":
         return shade if negate else 1.0 - shade
     percent = np.round(255.0 * shade)
@@ -154,44 +164,44 @@ def _load(path: Path) -> Mapping[str, Any]:
 
 
 def _number(path: Path, field: str, value: Any) -> float:
-    """A finite number; text that is one counts, as YAML 1.1 takes 5e-2 for text."""
+    """A finite number, also given as text, because YAML 1.1 reads 5e-2 as text."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise InputError(f"{_shown(value)} is not a finite number", path=path, field=field)
+        raise InputError(f"{_excerpt(value)} is not a finite number", path=path, field=field)
     return number
 
 
-def _shown(value: Any) -> str:
-    """A value as errors show it."""
+def _excerpt(value: Any) -> str:
+    """A value as text for an error, shortened."""
     text = repr(value)
     return text if len(text) <= 40 else text[:37] + "..."
 
 
 def _image_path(path: Path, name: Any) -> Path:
-    """Path of the image that a map names; it lies in the map's folder or below."""
+    """Path of a map's image, which must be in the map's folder or below."""
     if not isinstance(name, str) or not name or "\0" in name:
-        raise InputError(f"{_shown(name)} is no file name", path=path, field="image")
+        raise InputError(f"{_excerpt(name)} is no file name", path=path, field="image")
     image = path.parent / name
-    homes = {path.parent.resolve(), path.resolve().parent}
-    if Path(name).is_absolute() or not any(image.resolve().is_relative_to(x) for x in homes):
+    folders = {path.parent.resolve(), path.resolve().parent}
+    inside = any(image.resolve().is_relative_to(folder) for folder in folders)
+    if Path(name).is_absolute() or not inside:
+        problem = f"{_excerpt(name)} is outside the map's folder"
         advice = "put the image beside the YAML file and name it without its folder"
-        raise InputError(
-            f"{_shown(name)} lies outside the map's folder", path=path, field="image", advice=advice
-        )
+        raise InputError(problem, path=path, field="image", advice=advice)
     return image
 
 
-def _image(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Shade (H, W) float32 from 0, black, to 1, and whether the pixel is opaque (H, W) bool."""
+def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Shade (H, W) float32 from 0 (black) to 1 (white), and whether opaque (H, W) bool."""
     from PIL import Image, UnidentifiedImageError
 
     advice = "name a PGM, PNG or BMP image"
     try:
         with warnings.catch_warnings():
-            # Pillow's own limit warns first; ours stands below.
+            # Pillow warns of its own limit; ours is checked below.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path, formats=FORMATS) as image:
                 width, height = image.size

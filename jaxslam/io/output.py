@@ -1,4 +1,4 @@
-"""Results on disk: whole or not at all."""
+"""Atomic writing of results: a file appears complete or not at all."""
 
 import json
 import math
@@ -18,28 +18,28 @@ from jaxslam.io.errors import InputError
 
 @contextmanager
 def folder(path: str | PathLike) -> Iterator[Path]:
-    """Collect files in a temporary folder and move them to `path` when the block has ended well.
+    """Collect files in a temporary folder and move them to `path` when the block succeeds.
 
-    Each file appears whole and replaces one of the same name; others in `path` stay. If the block
-    raises, nothing appears.
+    Each file appears complete and replaces one of the same name; others in `path` stay. If the
+    block raises, no file appears.
 
     Args:
-        path: Final folder; made if needed, with its parents.
+        path: Final folder; created if needed, with its parents.
 
     Yields:
-        The temporary folder, on the same disk: inside `path`, or beside where it will be.
+        The temporary folder, on the same disk: inside `path` or its first existing parent.
 
     Raises:
         InputError: `path` is a file or cannot be written.
     """
     path = Path(path)
-    home = path
-    while not home.exists() and home != home.parent:
-        home = home.parent
-    if not home.is_dir():
-        raise InputError("is a file", path=home, advice="name a folder for the results")
+    existing = path
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError("is a file", path=existing, advice="name a folder for the results")
     try:
-        temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=home))
+        temporary = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=existing))
     except OSError as error:
         raise _cannot_write(path, error) from None
     try:
@@ -50,7 +50,7 @@ def folder(path: str | PathLike) -> Iterator[Path]:
 
 
 def _move_files(source: Path, target: Path) -> None:
-    """Move each file below `source` to the same place below `target`."""
+    """Move each file below `source` to the same relative path below `target`."""
     files = sorted(file.relative_to(source) for file in source.rglob("*") if file.is_file())
     for name in files:
         if (target / name).is_dir():
@@ -66,10 +66,13 @@ def _move_files(source: Path, target: Path) -> None:
 
 @contextmanager
 def replace(path: str | PathLike) -> Iterator[IO[bytes]]:
-    """A file to write to, which takes the place of `path` when the block has ended well.
+    """Open a temporary file that replaces `path` when the block succeeds.
 
     Args:
-        path: Its folder must exist. What was there stays if the block raises.
+        path: Its folder must exist. An existing file stays if the block raises.
+
+    Yields:
+        The temporary file, open for binary writing.
 
     Raises:
         InputError: The file cannot be written.
@@ -89,11 +92,11 @@ def replace(path: str | PathLike) -> Iterator[IO[bytes]]:
 
 
 def write_text(path: str | PathLike, text: str) -> None:
-    """Write a text file; it appears whole or not at all.
+    """Write a text file atomically.
 
     Args:
         path: File to write; its folder must exist.
-        text: All of its content.
+        text: Its content.
 
     Raises:
         InputError: The file cannot be written.
@@ -106,8 +109,8 @@ def write_json(path: str | PathLike, value: Any) -> None:
     """Write a value as JSON; NaN and infinity, which JSON lacks, become null.
 
     Args:
-        path: File to write, all of it or nothing.
-        value: Mappings, records, sequences, arrays and scalars, nested at will.
+        path: File to write, atomically.
+        value: Mappings, records, sequences, arrays and scalars, nested to any depth.
 
     Raises:
         InputError: The file cannot be written.
@@ -117,7 +120,13 @@ def write_json(path: str | PathLike, value: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """The same value in dicts, lists, numbers and strings; NaN and infinity become None."""
+    """Convert a value to what JSON can hold: dicts, lists, numbers, strings, None.
+
+    NaN and infinity become None.
+
+    Raises:
+        TypeError: Something in the value has no JSON form.
+    """
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -136,6 +145,6 @@ def plain(value: Any) -> Any:
 
 
 def _cannot_write(path: Path, error: OSError) -> InputError:
-    """Error that says why `path` cannot be written."""
+    """The InputError of a path that cannot be written."""
     advice = "name a folder that exists and that you may write to"
     return InputError(f"cannot be written ({error.strerror})", path=path, advice=advice)

@@ -1,4 +1,4 @@
-"""What the readers of recorded logs return."""
+"""Records that the readers of logs return: laser logs and landmark logs."""
 
 from typing import NamedTuple
 
@@ -7,54 +7,86 @@ import numpy as np
 from jaxslam.lidar import Lidar
 
 NOISE = 0.02
-"""Standard deviation [m] of a range; no log says it."""
+"""Standard deviation [m] of a range; logs do not state it."""
 
 REACH = 20.0
-"""Range [m] from which on a reading of an indoor scanner counts as no return."""
+"""Default range_max [m] of an indoor scanner: from here on a reading counts as no return."""
 
 TOLERATED = 0.05
-"""Part of a log's lines or scans that may be broken: they are left out and counted."""
+"""Fraction of a log's lines or scans that may be broken; they are skipped and counted."""
 
 
 class Recording(NamedTuple):
-    """A recorded drive of T scans of R beams, in file order: time stamps may run backwards.
+    """A log of T laser scans of R beams with odometry, in file order: times may decrease.
 
-    Poses are those the wheels report, in the frame of the wheel odometry.
+    Poses are by odometry, in the odometry frame (`odom`).
+
+    Attributes:
+        times: (T,) float64 [s] of each scan.
+        odometry: (T, 3) float64 [m, m, rad] pose by odometry at each scan.
+        ranges: (T, R) float32 [m]; inf where there is no return.
+        lidar: The scanner.
+        skipped: Number of broken lines, or of scans without odometry, left out.
+        wheel_times: (N,) float64 [s] of the whole odometry stream.
+        wheel_poses: (N, 3) float64 [m, m, rad] of the odometry stream; those of the scans if the
+            log has no separate stream.
+        source: Topics that were read, for messages; "" where there is no choice.
+        mended: Odometry repairs: what was wrong with the odometry and has been corrected.
     """
 
-    times: np.ndarray  # (T,) float64 [s] of each scan
-    odometry: np.ndarray  # (T, 3) float64 [m, m, rad] wheel pose of each scan
-    ranges: np.ndarray  # (T, R) float32 [m]; inf where nothing returned
+    times: np.ndarray
+    odometry: np.ndarray
+    ranges: np.ndarray
     lidar: Lidar
-    skipped: int  # broken lines, or scans without odometry, left out
-    wheel_times: np.ndarray  # (N,) float64 [s] of the whole stream of wheel poses
-    wheel_poses: np.ndarray  # (N, 3) float64 [m, m, rad]; the scans' own if there is no stream
-    source: str = ""  # what of the log it is, where there was a choice
-    mended: tuple[str, ...] = ()  # what was wrong with the odometry, and is put right here
+    skipped: int
+    wheel_times: np.ndarray
+    wheel_poses: np.ndarray
+    source: str = ""
+    mended: tuple[str, ...] = ()
 
 
 class Sightings(NamedTuple):
-    """A recorded drive of a robot whose sensor tells range, bearing and name of landmarks.
+    """A log of landmark measurements: range, bearing and ID, with odometry.
 
-    T steps in order of time, with up to M of the L landmarks each, or none. Motions are in the
-    frame of the step before. Left out are measurements of unknown names, and a second one of a
-    landmark at the same time.
+    T steps in order of time, with up to M of the L landmarks each, or none. Measurements of unknown
+    IDs are left out, and so is a second one of a landmark at the same time.
+
+    Attributes:
+        times: (T,) float64 [s].
+        motion: (T, 3) float64 [m, m, rad] odometry increment since the step before, in the frame
+            of that step; the first is 0.
+        polar: (T, M, 2) float32 range [m] and bearing [rad]; zero for padding.
+        valid: (T, M) bool, False marks padding, which comes last.
+        which: (T, M) int32 index 0..L-1 of the landmark; -1 for padding.
+        truth: (T, 3) float64 [m, m, rad] reference pose, world frame; zero where there is none.
+        referenced: (T,) bool, where there is a reference pose.
+        places: (L, 2) float64 [m] reference positions of the landmarks, world frame.
+        names: (L,) int32 IDs of the landmarks in the log.
+        skipped: Number of measurements left out.
     """
 
-    times: np.ndarray  # (T,) float64 [s]
-    motion: np.ndarray  # (T, 3) float64 [m, m, rad] by odometry since the step before; first: 0
-    polar: np.ndarray  # (T, M, 2) float32 range [m] and bearing [rad]; zero for padding
-    valid: np.ndarray  # (T, M) bool, False marks padding, which comes last
-    which: np.ndarray  # (T, M) int32 number 0..L-1 of the landmark; -1 for padding
-    truth: np.ndarray  # (T, 3) float64 [m, m, rad] reference pose, world frame; zero where none
-    referenced: np.ndarray  # (T,) bool, where there is one
-    places: np.ndarray  # (L, 2) float64 [m] reference positions of the landmarks, world frame
-    names: np.ndarray  # (L,) int32 what the recording calls them
-    skipped: int  # measurements left out
+    times: np.ndarray
+    motion: np.ndarray
+    polar: np.ndarray
+    valid: np.ndarray
+    which: np.ndarray
+    truth: np.ndarray
+    referenced: np.ndarray
+    places: np.ndarray
+    names: np.ndarray
+    skipped: int
 
 
 def no_return(ranges: np.ndarray, reach: float) -> np.ndarray:
-    """Ranges [m] as float32, infinite where they are not above zero or not below `reach`."""
+    """Mark readings that are no return.
+
+    Args:
+        ranges: Any shape [m].
+        reach: range_max [m].
+
+    Returns:
+        The ranges as float32, infinite where they are not above zero or not below `reach`.
+    """
     ranges = ranges.copy()
     ranges[~((ranges > 0.0) & (ranges < np.float32(reach)))] = np.inf
     ranges = ranges.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Verified relative poses, `t1 t2 x y z roll pitch yaw` a line, that a trajectory should obey."""
+"""Verified relative poses, one `t1 t2 x y z roll pitch yaw` per line, as a reference for SLAM."""
 
 from os import PathLike
 from typing import NamedTuple
@@ -11,19 +11,24 @@ FIELDS = ("t1", "t2", "x", "y", "z", "roll", "pitch", "yaw")
 
 
 class Relations(NamedTuple):
-    """N motions between two times of a log.
+    """N relative poses between two times of a log.
+
+    Attributes:
+        t1: (N,) [s].
+        t2: (N,) [s].
+        motion: (N, 3) [m, m, rad] pose at t2 in the robot frame at t1.
 
     References:
         Kuemmerle et al. (2009), On measuring the accuracy of SLAM algorithms.
     """
 
-    t1: np.ndarray  # (N,) [s]
-    t2: np.ndarray  # (N,) [s]
-    motion: np.ndarray  # (N, 3) [m, m, rad] pose at t2 in the robot frame at t1
+    t1: np.ndarray
+    t2: np.ndarray
+    motion: np.ndarray
 
 
 def read(path: str | PathLike) -> Relations:
-    """Read relations; height, roll and pitch are dropped.
+    """Read relative poses; z, roll and pitch are dropped.
 
     Args:
         path: Text file.

@@ -1,10 +1,10 @@
-"""ROBOTLASER1 lines: scans of the newer CARMEN toolkit, which pose graphs of g2o hold too.
+"""ROBOTLASER1 lines: scans of newer CARMEN logs, also used in g2o pose graphs.
 
     ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m
         laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side axis
         time host logger_time
 
-n ranges, m remissions, and the poses by odometry.
+n ranges, m remissions; the poses are by odometry.
 """
 
 import math
@@ -25,52 +25,80 @@ Name = TypeVar("Name")
 
 
 class Laser(NamedTuple):
-    """A scan."""
+    """A laser scan.
+
+    Attributes:
+        line: Number of its line.
+        time: [s].
+        first: [rad] angle_min: direction of the first beam.
+        step: [rad] angle_increment: from one beam to the next.
+        reach: [m] range_max.
+        ranges: (R,) float64 [m].
+        pose: (3,) [m, m, rad] of the laser, by odometry.
+    """
 
     line: int
-    time: float  # [s]
-    first: float  # [rad]
-    step: float  # [rad]
-    reach: float  # [m]
-    ranges: np.ndarray  # (R,) float64 [m]
-    pose: tuple[float, ...]  # (3,) of the laser [m, m, rad], by odometry
+    time: float
+    first: float
+    step: float
+    reach: float
+    ranges: np.ndarray
+    pose: tuple[float, ...]
 
 
 def parse(line: int, fields: list[bytes]) -> Laser:
-    """The scan of a line's fields; errors do not know the place.
+    """The scan of a line.
+
+    Args:
+        line: Number of the line.
+        fields: Its fields.
+
 
     Raises:
-        InputError: There are too few or too many fields, or one is no number or out of range.
+        InputError: There are too few or too many fields, or one is no number or out of range. It
+            carries no line number.
     """
     if len(fields) < 9:
         raise InputError(f"cut or damaged: {len(fields)} fields")
-    n = number(fields[8], "field 9 (n)")
-    if n < 2 or n != int(n):
-        raise InputError(f"{n:g} is no number of beams", field="field 9 (n)")
-    n = int(n)
-    m = number(fields[9 + n], f"field {10 + n} (m)") if len(fields) > 9 + n else 0.0
-    right = 24 + n + m
-    if len(fields) != right:
-        raise InputError(f"cut or damaged: {len(fields)} fields instead of {right:g}")
-    first, step, most = (number(fields[i], f"field {i + 1}") for i in (2, 4, 5))
-    if not 0.0 < step <= math.pi or not 0.0 < most:
-        raise InputError("step or greatest range is not positive", field="fields 5 and 6")
+    count = number(fields[8], "field 9 (n)")
+    if count < 2 or count != int(count):
+        raise InputError(f"{count:g} is not a beam count", field="field 9 (n)")
+    num_beams = int(count)
+    end = 9 + num_beams
+    remissions = number(fields[end], f"field {end + 1} (m)") if len(fields) > end else 0.0
+    num_fields = 24 + num_beams + remissions
+    if len(fields) != num_fields:
+        raise InputError(f"cut or damaged: {len(fields)} fields instead of {num_fields:g}")
+    angle_min, angle_increment, range_max = (number(fields[i], f"field {i + 1}") for i in (2, 4, 5))
+    if not 0.0 < angle_increment <= math.pi or not 0.0 < range_max:
+        raise InputError("step or maximum range is not positive", field="fields 5 and 6")
     try:
-        ranges = np.array([float(field) for field in fields[9 : 9 + n]])
+        ranges = np.array([float(field) for field in fields[9:end]])
     except ValueError:
         raise InputError("a range is not a number") from None
     if np.isnan(ranges).any():
         raise InputError("a range is not a number")
     names = ("laser_x", "laser_y", "laser_theta")
-    pose = tuple(number(x, name) for x, name in zip(fields[-14:-11], names, strict=True))
-    return Laser(line, number(fields[-3], "time"), first, step, most, ranges, pose)
+    pose = tuple(number(field, name) for field, name in zip(fields[-14:-11], names, strict=True))
+    time = number(fields[-3], "time")
+    return Laser(line, time, angle_min, angle_increment, range_max, ranges, pose)
 
 
 def alike(scans: Mapping[Name, Laser]) -> tuple[dict[Name, Laser], dict[int, str]]:
-    """Scans with the most frequent scanner, and what is wrong with the others by line."""
+    """Select the scans with the most frequent scanner metadata.
+
+    Args:
+        scans: Scans by any key.
+
+    Returns:
+        The selected scans, and what is wrong with the others by line number.
+    """
     if not scans:
         return {}, {}
-    scanner = lambda one: (one.first, one.step, one.reach, one.ranges.size)
-    usual = Counter(map(scanner, scans.values())).most_common(1)[0][0]
-    odd = {one.line: "another scanner" for one in scans.values() if scanner(one) != usual}
-    return {name: one for name, one in scans.items() if one.line not in odd}, odd
+
+    def metadata(scan: Laser) -> tuple[float, ...]:
+        return scan.first, scan.step, scan.reach, scan.ranges.size
+
+    usual = Counter(map(metadata, scans.values())).most_common(1)[0][0]
+    others = {scan.line: "another scanner" for scan in scans.values() if metadata(scan) != usual}
+    return {name: scan for name, scan in scans.items() if scan.line not in others}, others

@@ -1,4 +1,4 @@
-"""Lines and numbers of text files, plain or packed; their errors say where."""
+"""Lines, numbers and tables of text files, plain or compressed; errors name the line."""
 
 import gzip
 import math
@@ -17,20 +17,37 @@ from jaxslam.io.errors import InputError
 
 
 def shown(items: Iterable, path: Path, unit: str, total: int | None = None) -> Iterable:
-    """The items of a file; on a terminal, how far the reading is when it takes its time."""
-    look = {"unit": unit, "total": total, "leave": False, "delay": 1.0, "disable": None}
-    return tqdm(items, desc=f"reading {path.name}", unit_scale=True, **look)
+    """Iterate over the items of a file with a progress bar.
+
+    The bar appears on a terminal only, and after one second.
+
+    Args:
+        items: The items.
+        path: The file.
+        unit: What an item is called.
+        total: Number of items, if known.
+    """
+    return tqdm(
+        items,
+        desc=f"reading {path.name}",
+        unit=unit,
+        unit_scale=True,
+        total=total,
+        leave=False,
+        delay=1.0,
+        disable=None,
+    )
 
 
 def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
     """Yield each line of a text file with its number, counted from 1.
 
     Args:
-        path: Text file; a gzipped one, or the only one in a zip archive, is unpacked on the way.
+        path: Text file; a gzipped one, or the only one in a zip archive, is unpacked.
 
     Raises:
-        InputError: The file is missing, a folder, unreadable, empty, binary or damaged where it is
-            packed; an archive holds several.
+        InputError: The file is missing, a folder, unreadable, empty, binary, or a damaged archive;
+            or an archive holds several files.
     """
     path = Path(path)
     if path.is_dir():
@@ -43,27 +60,24 @@ def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
             if b"\0" in head:
                 raise InputError("is binary", path=path, advice="name a text file")
             file.seek(0)
-            for number, line in enumerate(shown(file, path, "line"), start=1):
-                yield number, line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
+            for count, line in enumerate(shown(file, path, "line"), start=1):
+                yield count, line.removeprefix(b"\xef\xbb\xbf") if count == 1 else line
     except FileNotFoundError:
         raise InputError("does not exist", path=path, advice="check the name") from None
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise InputError(
-            f"is a damaged gzip file ({error})", path=path, advice="copy it again"
-        ) from None
+        problem = f"is a damaged gzip file ({error})"
+        raise InputError(problem, path=path, advice="copy it again") from None
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise InputError(
-            f"is a zip archive that cannot be read ({error})", path=path, advice="unpack it"
-        ) from None
+        problem = f"is a zip archive that cannot be read ({error})"
+        raise InputError(problem, path=path, advice="unpack it") from None
     except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", path=path, advice="check its permissions"
-        ) from None
+        problem = f"cannot be read ({error.strerror})"
+        raise InputError(problem, path=path, advice="check its permissions") from None
 
 
 @contextmanager
 def _open(path: Path) -> Iterator[IO[bytes]]:
-    """A file's content, unpacked."""
+    """Open a file, decompressed."""
     with open(path, "rb") as file:
         head = file.read(4)
     if head[:2] == b"\x1f\x8b":
@@ -71,8 +85,8 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
             yield file
     elif head == b"PK\3\4":
         with zipfile.ZipFile(path) as archive:
-            names = [one for one in archive.namelist() if not one.endswith("/")]
-            names = [one for one in names if not one.startswith("__MACOSX/")]
+            names = [name for name in archive.namelist() if not name.endswith("/")]
+            names = [name for name in names if not name.startswith("__MACOSX/")]
             if len(names) != 1:
                 problem = f"is a zip archive of {len(names)} files"
                 raise InputError(problem, path=path, advice="unpack it and name one of them")
@@ -88,16 +102,16 @@ def number(field: bytes, name: str) -> float:
 
     Args:
         field: Text of the field.
-        name: How the error calls it.
+        name: Its name, for the error.
 
     Raises:
-        InputError: The text is no number, or NaN or infinite; without the place.
+        InputError: The text is no number, or NaN or infinite. It carries no line number.
     """
     try:
         value = float(field)
     except ValueError:
-        shown = field[:20].decode("utf-8", "replace")
-        raise InputError(f"{shown!r} is not a number", field=name) from None
+        excerpt = field[:20].decode("utf-8", "replace")
+        raise InputError(f"{excerpt!r} is not a number", field=name) from None
     if not math.isfinite(value):
         raise InputError(f"{value} is not finite", field=name)
     return value
@@ -108,14 +122,14 @@ def rows(path: str | PathLike, names: Sequence[str], form: str) -> list[tuple[in
 
     Args:
         path: Text file; `#` starts a comment line.
-        names: What the fields are called, in order.
-        form: What such a file is called, for the errors.
+        names: Names of the fields, in order.
+        form: Name of the file format, for the errors.
 
     Raises:
-        InputError: As `lines`; a line has too few or too many fields, or one is no finite
-            number; there is no line but comments.
+        InputError: As `lines`; or a line has too few or too many fields, or one is no finite
+            number; or there are only comments.
     """
-    table = []
+    parsed = []
     for line, text in lines(path):
         fields = text.split()
         if not fields or fields[0].startswith(b"#"):
@@ -128,19 +142,19 @@ def rows(path: str | PathLike, names: Sequence[str], form: str) -> list[tuple[in
             values = [number(field, name) for field, name in zip(fields, names, strict=True)]
         except InputError as error:
             raise InputError(str(error), path=path, line=line, advice=advice) from None
-        table.append((line, values))
-    if not table:
+        parsed.append((line, values))
+    if not parsed:
         raise InputError("holds only comments", path=path, advice=f"name a file of {form}")
-    return table
+    return parsed
 
 
 def table(path: str | PathLike, names: Sequence[str], form: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a long table as `rows` does, in a fraction of the time.
+    """Read a long table as `rows` does, but by NumPy, which is much faster.
 
     Args:
         path: Text file; `#` starts a comment line.
-        names: What the K fields are called, in order.
-        form: What such a file is called, for the errors.
+        names: Names of the K fields, in order.
+        form: Name of the file format, for the errors.
 
     Returns:
         Line numbers (N,) and values (N, K).
@@ -155,6 +169,6 @@ def table(path: str | PathLike, names: Sequence[str], form: str) -> tuple[np.nda
     except ValueError:
         values = None
     if values is None or values.shape[1] != len(names) or not np.isfinite(values).all():
-        kept = rows(path, names, form)  # says where it is broken
+        kept = rows(path, names, form)  # raises with the line that is broken
         values = np.array([row for _, row in kept])
     return np.array([line for line, _ in kept]), values

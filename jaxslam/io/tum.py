@@ -1,4 +1,4 @@
-"""Trajectories in the TUM format, `t x y z qx qy qz qw` a line, as evo and others read it."""
+"""Trajectories in the TUM format, `t x y z qx qy qz qw` per line, which evo and others read."""
 
 import math
 from os import PathLike
@@ -13,10 +13,10 @@ FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def read(path: str | PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) [s] and poses (N, 3) [m, m, rad] of a trajectory, seen from above.
+    """Times (N,) [s] and poses (N, 3) [m, m, rad] of a trajectory, projected to the plane.
 
     Args:
-        path: Text file; height, roll and pitch are dropped.
+        path: Text file; z, roll and pitch are dropped.
 
     Raises:
         InputError: The file cannot be read, or a line is not eight finite numbers of which the
@@ -36,26 +36,26 @@ def read(path: str | PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write(path: str | PathLike, times: np.ndarray, poses: np.ndarray) -> None:
-    """Write a trajectory; every number is read back as it was.
+    """Write a trajectory; every number is read back exactly.
 
     Args:
-        path: File to write, all of it or nothing.
+        path: File to write, atomically.
         times: (N,) [s].
         poses: (N, 3) [m, m, rad].
 
     Raises:
-        InputError: The arrays do not fit together, hold NaN or infinity, or cannot be written.
+        InputError: The shapes do not match, a pose is not finite, or the file cannot be written.
     """
     times, poses = np.asarray(times, np.float64), np.asarray(poses, np.float64)
     if times.ndim != 1 or poses.shape != (times.size, 3):
         problem = f"times {times.shape} and poses {poses.shape} are not (N,) and (N, 3)"
         raise InputError(problem, path=path)
-    bad = ~np.isfinite(np.column_stack([times, poses])).all(axis=1)
-    if bad.any():
-        problem = f"pose {int(np.argmax(bad))} is not finite"
+    not_finite = ~np.isfinite(np.column_stack([times, poses])).all(axis=1)
+    if not_finite.any():
+        problem = f"pose {int(np.argmax(not_finite))} is not finite"
         raise InputError(problem, path=path, advice="write only the poses before it")
     text = "".join(
-        f"{t!r} {x!r} {y!r} 0 0 0 {math.sin(heading / 2)!r} {math.cos(heading / 2)!r}\n"
-        for t, (x, y, heading) in zip(times.tolist(), poses.tolist(), strict=True)
+        f"{time!r} {x!r} {y!r} 0 0 0 {math.sin(heading / 2)!r} {math.cos(heading / 2)!r}\n"
+        for time, (x, y, heading) in zip(times.tolist(), poses.tolist(), strict=True)
     )
     write_text(path, "# t x y z qx qy qz qw\n" + text)

@@ -1,52 +1,74 @@
-"""The odometry of a log, checked: where it was started anew, and where scans have another's poses.
+"""Checks of a log's odometry: restarts, and poses of scans that are not odometry.
 
-Public logs often hold poses that a SLAM program has corrected in the lines of the scans, and those
-of the wheels in lines of their own; and a robot that was switched off and on counts from zero.
+Many public logs hold poses corrected by a SLAM program in the lines of the scans, and the raw
+odometry in lines of their own; and the odometry restarts at zero when a robot is switched off and
+on.
 """
 
 import numpy as np
 
 from jaxslam.poses import by_time, chain, interpolate, seen_from
 
-JUMP = np.array([1.0, 1.0])  # [m], [rad] beyond what a robot moves, odometry was started anew
+JUMP = np.array([1.0, 1.0])  # [m], [rad] tolerance of `jumps`, beyond what `PACE` allows
 PACE = np.array([5.0, 5.0])  # [m/s], [rad/s] no robot of these logs is faster
-SPREAD = np.array([0.3, 0.1])  # [m], [rad] between two frames that are the same
-INSIDE = 0.9  # part of the scans that must lie in the time of the wheels for a comparison
+SPREAD = np.array([0.3, 0.1])  # [m], [rad] tolerance of `foreign`
+INSIDE = 0.9  # least fraction of the scans within the time of the odometry, for a comparison
 
 
 def jumps(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Steps (N - 1,) bool of poses (N, 3) at times (N,) [s] that no robot makes."""
-    moved = seen_from(poses[:-1], poses[1:])
-    size = np.column_stack([np.hypot(moved[:, 0], moved[:, 1]), np.abs(moved[:, 2])])
+    """Find steps that are too large for a robot.
+
+    Args:
+        times: (N,) [s].
+        poses: (N, 3) [m, m, rad] by odometry.
+
+    Returns:
+        (N - 1,) bool: the step is larger than `JUMP` + `PACE` * its duration.
+    """
+    motion = seen_from(poses[:-1], poses[1:])
+    size = np.column_stack([np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])])
     return (size > JUMP + PACE * np.abs(np.diff(times))[:, None]).any(axis=1)
 
 
 def without_jumps(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, int]:
-    """Poses (N, 3) in which the robot stands still where it seemed to jump, and how often it did.
+    """Replace jumps of the odometry by no motion.
 
-    They begin where the given ones begin.
+    Args:
+        times: (N,) [s].
+        poses: (N, 3) [m, m, rad] by odometry.
+
+    Returns:
+        Poses (N, 3) that start at the first given one, and the number of jumps.
     """
-    jump = jumps(times, poses)
-    if not jump.any():
+    is_jump = jumps(times, poses)
+    if not is_jump.any():
         return poses, 0
-    moves = seen_from(poses[:-1], poses[1:])
-    moves[jump] = 0.0
-    return chain(moves, poses[0]), int(jump.sum())
+    increments = seen_from(poses[:-1], poses[1:])
+    increments[is_jump] = 0.0
+    return chain(increments, poses[0]), int(is_jump.sum())
 
 
 def foreign(
     times: np.ndarray, poses: np.ndarray, wheel_times: np.ndarray, wheel_poses: np.ndarray
 ) -> bool:
-    """Whether poses (T, 3) of scans are not those of the wheels (N, 3): corrected by another.
+    """Whether the poses of scans differ from the odometry: another program corrected them.
 
-    A constant offset is a scanner that does not sit in the middle of the robot.
+    A constant offset is allowed: a scanner that is not at the centre of the robot. Compared is the
+    90 % quantile of the deviation from the median offset, with `SPREAD`.
+
+    Args:
+        times: (T,) [s] of the scans.
+        poses: (T, 3) [m, m, rad] of the scans.
+        wheel_times: (N,) [s] of the odometry.
+        wheel_poses: (N, 3) [m, m, rad] of the odometry.
     """
     inside = (times >= wheel_times.min()) & (times <= wheel_times.max())
     if len(wheel_times) < 2 or inside.mean() < INSIDE:
         return False
-    at = interpolate(times[inside], *by_time(wheel_times, wheel_poses))
-    gap = seen_from(at, poses[inside])
-    gap = seen_from(gap[0], gap)
-    off = np.abs(gap - np.median(gap, axis=0))
-    spread = np.quantile(np.hypot(off[:, 0], off[:, 1]), 0.9), np.quantile(off[:, 2], 0.9)
+    odometry = interpolate(times[inside], *by_time(wheel_times, wheel_poses))
+    offset = seen_from(odometry, poses[inside])
+    offset = seen_from(offset[0], offset)
+    deviation = np.abs(offset - np.median(offset, axis=0))
+    distance = np.hypot(deviation[:, 0], deviation[:, 1])
+    spread = np.quantile(distance, 0.9), np.quantile(deviation[:, 2], 0.9)
     return bool((spread > SPREAD).any())

@@ -1,6 +1,6 @@
-"""Figures of worlds, trajectories, maps, errors and local diagrams, drawn on given axes.
+"""Plots of worlds, trajectories, maps, errors and local Voronoi diagrams, on given axes.
 
-The only part of the library that imports matplotlib.
+The only package of the library that imports matplotlib.
 """
 
 from jaxslam.plot.charts import errors as errors

@@ -1,4 +1,4 @@
-"""Numbers: errors over the scans of a run, losses and parameters over the steps of a fit."""
+"""Charts: pose errors over the scans of a run; losses and parameters over a tuning."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,26 +8,26 @@ from jaxslam.plot.sheet import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SIGM
 
 
 def errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -> None:
-    """Draw errors of heading, y and x with their 3-sigma bounds over the scans.
+    """Draw the errors of heading, y and x with their 3-sigma bounds over the scans.
 
     Args:
-        axes: (3,) axes, one below the other.
-        cov: (T, 3, 3) covariance of the poses.
-        error: (T, 3) [m, m, rad]; the bounds alone without it.
+        axes: (3,) axes, top to bottom.
+        cov: (T, 3, 3) pose covariance [m, m, rad].
+        error: (T, 3) pose error [m, m, rad]; None: only the bounds are drawn.
 
     References:
         Paper, Fig. 13.
     """
     bound = SIGMAS * np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))  # (T, 3)
     scan = np.arange(len(bound))
-    names = (("heading [deg]", 2, 180 / np.pi), ("y [m]", 1, 1.0), ("x [m]", 0, 1.0))
-    for axis, (name, k, unit) in zip(axes, names, strict=True):
-        high = unit * bound[:, k]
+    rows = (("heading [deg]", 2, 180 / np.pi), ("y [m]", 1, 1.0), ("x [m]", 0, 1.0))
+    for axis, (name, column, factor) in zip(axes, rows, strict=True):
+        high = factor * bound[:, column]
         axis.fill_between(scan, -high, high, color=SKY, alpha=0.35, linewidth=0)
         axis.plot(scan, high, color=BLUE, linewidth=1.0, label=f"{SIGMAS:g}-sigma bound")
         axis.plot(scan, -high, color=BLUE, linewidth=1.0)
         if error is not None:
-            axis.plot(scan, unit * error[:, k], color=BLACK, linewidth=1.2, label="error")
+            axis.plot(scan, factor * error[:, column], color=BLACK, linewidth=1.2, label="error")
         axis.axhline(0.0, color=GREY, linewidth=0.6)
         axis.set(ylabel=name, xlim=(0, max(len(scan) - 1, 1)))
         axis.margins(y=0.08)
@@ -36,12 +36,19 @@ def errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -
 
 
 def losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> None:
-    """Draw losses over the evaluations (N,) of a fit, those of held-out runs where not NaN."""
-    steps = np.arange(len(training))
-    axis.plot(steps, training, color=SKY, label="training")
-    judged = np.isfinite(heldout)
-    if judged.any():
-        axis.plot(steps[judged], heldout[judged], color=ORANGE, linestyle="--", label="held out")
+    """Draw the losses of a tuning.
+
+    Args:
+        axis: Axis to draw on.
+        training: (N,) training loss of each evaluation.
+        heldout: (N,) loss of the held-out runs; NaN where not evaluated.
+        best: Index of the best evaluation.
+    """
+    evaluation = np.arange(len(training))
+    axis.plot(evaluation, training, color=SKY, label="training")
+    known = np.isfinite(heldout)
+    if known.any():
+        axis.plot(evaluation[known], heldout[known], color=ORANGE, linestyle="--", label="held out")
     axis.axvline(best, color=GREY, linewidth=0.8, label="best")
     axis.set(xlabel="evaluation", ylabel="loss")
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -49,14 +56,21 @@ def losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> 
 
 
 def parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, best: int) -> None:
-    """Draw parameters (N, P) over the evaluations of a fit, in units of where they began."""
+    """Draw the parameters over the evaluations of a tuning, relative to their initial values.
+
+    Args:
+        axis: Axis to draw on.
+        names: (P,) names of the parameters.
+        history: (N, P) parameters of each evaluation.
+        best: Index of the best evaluation.
+    """
     colours = (BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK, GREY)
     styles = ("-", "--", "-.", ":")
-    for i, (name, values) in enumerate(zip(names, history.T, strict=True)):
-        look = {"color": colours[i % len(colours)], "linestyle": styles[i % len(styles)]}
-        axis.plot(values / values[0], label=name, **look)
+    for index, (name, values) in enumerate(zip(names, history.T, strict=True)):
+        colour, style = colours[index % len(colours)], styles[index % len(styles)]
+        axis.plot(values / values[0], label=name, color=colour, linestyle=style)
     axis.axvline(best, color=GREY, linewidth=0.8)
-    axis.set(xlabel="evaluation", ylabel="noise / noise at the start", yscale="log")
+    axis.set(xlabel="evaluation", ylabel="noise / initial noise", yscale="log")
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.yaxis.set_major_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""Films: figures that change, as GIF."""
+"""Animations: figures that change, written as GIF."""
 
 from collections.abc import Callable
 from os import PathLike
@@ -6,20 +6,20 @@ from os import PathLike
 from matplotlib.animation import PillowWriter
 from matplotlib.figure import Figure
 
-RATE = 12  # frames a second
+RATE = 12  # [frames per second]
 
 
 def film(path: str | PathLike, figure: Figure, draw: Callable[[int], None], frames: int) -> None:
-    """Write a film as GIF.
+    """Write an animation of a figure as GIF.
 
     Args:
         path: File to write.
-        figure: What is filmed.
-        draw: Changes the figure to frame k, for k from 0 to `frames` - 1 in turn.
-        frames: How many.
+        figure: The figure.
+        draw: Draws frame k on the figure; called for k = 0 .. `frames` - 1 in order.
+        frames: Number of frames.
     """
     writer = PillowWriter(fps=RATE)
     with writer.saving(figure, str(path), dpi=figure.dpi):
-        for k in range(frames):
-            draw(k)
+        for frame in range(frames):
+            draw(frame)
             writer.grab_frame()

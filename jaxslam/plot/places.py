@@ -1,4 +1,4 @@
-"""Places: worlds, trajectories, landmarks, arcs, occupancy grids, the local diagram of a scan.
+"""Map drawing: worlds, trajectories, landmarks, arcs, occupancy grids, local Voronoi diagrams.
 
 Lines differ in style as well as in colour, and landmarks in shape.
 """
@@ -21,17 +21,17 @@ from jaxslam.types import CORNER, NODE
 from jaxslam.voronoi import Diagram, branches
 from jaxslam.world import World
 
-DOTS = 40_000  # ends of beams drawn at most
+DOTS = 40_000  # end points of beams drawn at most
 
-# Colour, width, dashes and height in the picture of each trajectory.
+# Colour, line width, line style and zorder of each trajectory.
 LINES = {
     "estimate": (SKY, 3.0, "-", 2.0),
     "truth": (BLACK, 1.2, (0, (4, 2)), 2.2),
     "reference": (BLACK, 1.2, (0, (4, 2)), 2.2),
     "odometry": (RED, 1.1, (0, (1, 1.2)), 2.1),
 }
-# Marker, colour and name in the legend of each kind of landmark that has a place.
-MARKS = {NODE: ("o", GREEN, "node"), CORNER: ("s", ORANGE, "corner")}
+# Marker, colour and legend name of each kind of landmark that has a position.
+MARKS = {NODE: ("o", GREEN, "junction"), CORNER: ("s", ORANGE, "corner")}
 
 
 def walls(axis: Axes, world: World) -> None:
@@ -41,57 +41,61 @@ def walls(axis: Axes, world: World) -> None:
 
 
 def echoes(axis: Axes, poses: np.ndarray, points: np.ndarray, hit: np.ndarray) -> None:
-    """Draw where beams ended, thinned out.
+    """Draw the end points of the beams, at most `DOTS` of them.
 
     Args:
-        axis: Where to draw.
-        poses: (T, 3) of the scans, world.
-        points: (T, R, 2) ends of their beams [m, robot frame].
-        hit: (T, R) bool, those that returned.
+        axis: Axis to draw on.
+        poses: (T, 3) [m, m, rad] of the scans, world frame.
+        points: (T, R, 2) end points of the beams [m, robot frame].
+        hit: (T, R) bool, False where there is no return.
     """
-    step, beam = np.nonzero(hit)
-    thin = slice(None, None, 1 + len(step) // DOTS)
-    there = placed(np.asarray(poses)[step[thin]], points[step[thin], beam[thin]])
-    axis.plot(*there.T, ",", color="#B5B5B5", zorder=0.5, label="_echoes", rasterized=True)
+    scan, beam = np.nonzero(hit)
+    stride = 1 + len(scan) // DOTS
+    scan, beam = scan[::stride], beam[::stride]
+    x, y = placed(np.asarray(poses)[scan], points[scan, beam]).T
+    axis.plot(x, y, ",", color="#B5B5B5", zorder=0.5, label="_echoes", rasterized=True)
 
 
 def trajectory(axis: Axes, poses: np.ndarray, what: str) -> None:
-    """Draw a way of the robot.
+    """Draw a trajectory of the robot.
 
     Args:
-        axis: Where to draw.
-        poses: (T, 3), world.
+        axis: Axis to draw on.
+        poses: (T, 3) [m, m, rad], world frame.
         what: One of `LINES`; also its name in the legend.
     """
-    color, width, dashes, height = LINES[what]
-    style = {"color": color, "linewidth": width, "linestyle": dashes, "zorder": height}
-    axis.plot(*np.asarray(poses)[:, :2].T, label=what, **style)
+    colour, width, style, zorder = LINES[what]
+    x, y = np.asarray(poses)[:, :2].T
+    axis.plot(x, y, label=what, color=colour, linewidth=width, linestyle=style, zorder=zorder)
 
 
 def robot(axis: Axes, pose: np.ndarray, ends: np.ndarray) -> None:
-    """Draw a robot at a pose (3,) and the ends (N, 2) of its beams [m, robot frame]."""
+    """Draw the robot at a pose (3,), and the end points (N, 2) of its beams [m, robot frame]."""
     x, y, heading = pose = np.asarray(pose, float)
-    axis.plot(*placed(pose, ends).T, ".", color=ORANGE, markersize=2.5, zorder=2.5, label="scan")
+    points = placed(pose, ends)
+    axis.plot(
+        points[:, 0], points[:, 1], ".", color=ORANGE, markersize=2.5, zorder=2.5, label="scan"
+    )
     marker = (3, 0, np.degrees(heading) - 90)
     axis.plot(x, y, marker=marker, color=BLUE, markersize=10, zorder=4, label="_robot")
 
 
 def ends(axis: Axes, poses: np.ndarray) -> None:
-    """Mark start S and end F of a way (T, 3) of the robot."""
+    """Mark the start S and the finish F of a trajectory (T, 3)."""
+    box = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": BLACK}
     for name, pose in (("S", poses[0]), ("F", poses[-1])):
-        at = np.asarray(pose[:2], float)
-        box = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": BLACK}
-        axis.text(*at, name, ha="center", va="center", fontsize=8, weight="bold", bbox=box)
+        x, y = np.asarray(pose[:2], float)
+        axis.text(x, y, name, ha="center", va="center", fontsize=8, weight="bold", bbox=box)
 
 
 def ellipses(axis: Axes, xy: np.ndarray, cov: np.ndarray, color: str) -> None:
     """Draw the 3-sigma ellipses of points.
 
     Args:
-        axis: Where to draw.
-        xy: (N, 2) [m].
-        cov: (N, 2, 2) [m^2].
-        color: Of the lines.
+        axis: Axis to draw on.
+        xy: (N, 2) [m] centres.
+        cov: (N, 2, 2) [m^2] covariances.
+        color: Colour of the lines.
     """
     values, vectors = np.linalg.eigh(np.asarray(cov, float))  # ascending
     width, height = 2 * SIGMAS * np.sqrt(np.maximum(values.T[::-1], 0.0))
@@ -105,95 +109,113 @@ def ellipses(axis: Axes, xy: np.ndarray, cov: np.ndarray, color: str) -> None:
 
 
 def landmarks(axis: Axes, belief: Belief, *, confirm: int) -> None:
-    """Draw nodes and corners of a belief that were seen `confirm` times, with their covariance."""
-    seen, kind = np.asarray(belief.seen), np.asarray(belief.kind)
-    place, own = np.asarray(belief.places), np.asarray(blocks_of(belief.map_cov))
-    for which in MARKS:
-        _marks(axis, place, own, (seen >= confirm) & (kind == which), which)
+    """Draw the junctions and corners of a belief, with their 3-sigma ellipses.
+
+    Args:
+        axis: Axis to draw on.
+        belief: Belief of the filter.
+        confirm: Least number of observations of a landmark.
+    """
+    count, kind = np.asarray(belief.seen), np.asarray(belief.kind)
+    position, cov = np.asarray(belief.places), np.asarray(blocks_of(belief.map_cov))
+    for drawn in MARKS:
+        use = (count >= confirm) & (kind == drawn)
+        _draw_landmarks(axis, position[use], cov[use], drawn)
 
 
-def _marks(axis: Axes, xy: np.ndarray, cov: np.ndarray, use: np.ndarray, kind: int) -> None:
-    """Draw those landmarks (N, 2) of one kind that `use` (N,) picks, with their ellipses."""
-    marker, color, name = MARKS[kind]
-    style = {"color": color, "markersize": 4, "markeredgecolor": "white", "markeredgewidth": 0.4}
+def _draw_landmarks(axis: Axes, xy: np.ndarray, cov: np.ndarray, kind: int) -> None:
+    """Draw landmarks (N, 2) of one kind with the ellipses of their covariances (N, 2, 2)."""
+    marker, colour, name = MARKS[kind]
+    style = {"color": colour, "markersize": 4, "markeredgecolor": "white", "markeredgewidth": 0.4}
     label = f"{name}, {SIGMAS:g}-sigma ellipse"
-    axis.plot(*xy[use].T, marker, linestyle="none", label=label, zorder=3.5, **style)
-    ellipses(axis, xy[use], cov[use], color)
+    axis.plot(xy[:, 0], xy[:, 1], marker, linestyle="none", label=label, zorder=3.5, **style)
+    ellipses(axis, xy, cov, colour)
 
 
 def arcs(axis: Axes, graph: Graph) -> None:
     """Draw the arcs of a topological map."""
-    style = {"colors": GREEN, "linewidths": 1.0, "alpha": 0.6, "zorder": 1.5}
-    axis.add_collection(LineCollection(graph.lines, label="arc", **style))
+    axis.add_collection(
+        LineCollection(
+            graph.lines, label="arc", colors=GREEN, linewidths=1.0, alpha=0.6, zorder=1.5
+        )
+    )
 
 
 def local(
     axis: Axes, diagram: Diagram, sources: np.ndarray, spec: GridSpec, seen: Nodes | None = None
 ) -> None:
-    """Draw the local diagram of a scan as the robot sees it: x up, y to the left.
+    """Draw the local Voronoi diagram of a scan in the robot frame: x up, y to the left.
 
     Args:
-        axis: Where to draw.
-        diagram: (H, W) regions.
-        sources: (H, W) bool, cells they came from.
-        spec: Their grid.
-        seen: Landmarks of the scan.
+        axis: Axis to draw on.
+        diagram: (H, W) Voronoi regions.
+        sources: (H, W) bool, occupied cells that the regions grew from.
+        spec: Grid of the cells.
+        seen: Features of the scan.
     """
     labels, sources = np.asarray(diagram.labels), np.asarray(sources)
-    colors = np.array([to_rgb(c) for c in (SKY, ORANGE, GREEN, PINK, YELLOW, BLUE, RED)])
-    lowest = np.log2(np.maximum(labels & -labels.astype(np.int64), 1)).astype(int)
-    own = colors[lowest % len(colors)]
-    image = np.where((labels != 0)[..., None], 0.3 * own + 0.7, 1.0)
+    palette = np.array([to_rgb(colour) for colour in (SKY, ORANGE, GREEN, PINK, YELLOW, BLUE, RED)])
+    lowest_bit = np.log2(np.maximum(labels & -labels.astype(np.int64), 1)).astype(int)
+    cell_colours = palette[lowest_bit % len(palette)]
+    image = np.where((labels != 0)[..., None], 0.3 * cell_colours + 0.7, 1.0)
     image[np.asarray(branches(diagram, sources))] = to_rgb(BLACK)
-    image[sources] = 0.75 * own[sources]
+    image[sources] = 0.75 * cell_colours[sources]
     extent = (-spec.side, spec.side, -spec.behind, spec.ahead)
     axis.imshow(image, origin="lower", extent=extent, interpolation="none")
     axis.plot(0, 0, "^", color=RED, markersize=8, clip_on=False)
     if seen is not None:
         xy, cov = np.asarray(seen.xy)[:, ::-1], np.asarray(seen.cov)[:, ::-1, ::-1]
         for kind in MARKS:
-            _marks(axis, xy, cov, np.asarray(seen.valid & (seen.kind == kind)), kind)
+            use = np.asarray(seen.valid & (seen.kind == kind))
+            _draw_landmarks(axis, xy[use], cov[use], kind)
     axis.set(xlim=(spec.side, -spec.side), ylim=(-spec.behind, spec.ahead), aspect="equal")
-    axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")
+    axis.set(xlabel="y (left) [m]", ylabel="x (forward) [m]")
 
 
 def outline(map: Occupancy) -> np.ndarray:
-    """Corners (4, 2) [m, map] of the part of an occupancy grid that is not unknown."""
+    """Corners (4, 2) [m, map frame] of the bounding box of the known cells of a grid."""
     known = np.argwhere(map.occupied | map.free)
     low, high = known.min(axis=0), known.max(axis=0) + 1
-    return _placing(map).transform([low, (high[0], low[1]), high, (low[0], high[1])])
+    return _cells_to_map(map).transform([low, (high[0], low[1]), high, (low[0], high[1])])
 
 
-def _placing(map: Occupancy) -> Affine2D:
-    """From cells to the frame of the map."""
-    x, y, heading = np.asarray(map.origin, float)
-    return Affine2D().scale(map.resolution).rotate(heading).translate(x, y)
+def _cells_to_map(grid: Occupancy) -> Affine2D:
+    """The transform from cell indices to the map frame."""
+    x, y, heading = np.asarray(grid.origin, float)
+    return Affine2D().scale(grid.resolution).rotate(heading).translate(x, y)
 
 
 def occupancy(axis: Axes, map: Occupancy) -> None:
     """Draw an occupancy grid: occupied cells dark, unknown ones grey."""
     image = np.where(map.free, 255, 205).astype(np.uint8)
     image[map.occupied] = 60
-    style = {"cmap": "gray", "vmin": 0, "vmax": 255, "interpolation": "none", "zorder": 0.5}
-    extent = (0, image.shape[0], 0, image.shape[1])
     limits = axis.get_xlim(), axis.get_ylim()
     axis.set_facecolor((205 / 255,) * 3)
     axis.imshow(
-        image.T, origin="lower", extent=extent, transform=_placing(map) + axis.transData, **style
+        image.T,
+        origin="lower",
+        extent=(0, image.shape[0], 0, image.shape[1]),
+        transform=_cells_to_map(map) + axis.transData,
+        cmap="gray",
+        vmin=0,
+        vmax=255,
+        interpolation="none",
+        zorder=0.5,
     )
     axis.set(xlim=limits[0], ylim=limits[1], aspect="equal")
 
 
 def roads(axis: Axes, graph: Graph) -> None:
-    """Draw the topological map of an occupancy grid; junctions and dead ends differ in shape."""
-    style = {"colors": BLUE, "linewidths": 1.1, "zorder": 1.5}
-    axis.add_collection(LineCollection(graph.lines, label="arc", **style))
+    """Draw the topological map of an occupancy grid; nodes and dead ends differ in marker."""
+    axis.add_collection(
+        LineCollection(graph.lines, label="arc", colors=BLUE, linewidths=1.1, zorder=1.5)
+    )
     degree = np.bincount(graph.pairs.ravel(), minlength=len(graph.id))
-    for name, marker, color, use in (
+    for name, marker, colour, use in (
         ("node", "o", RED, degree != 1),
         ("dead end", "s", ORANGE, degree == 1),
     ):
-        style = {"color": color, "markersize": 4, "markeredgecolor": "white", "zorder": 2}
         if use.any():
-            edge = {"markeredgewidth": 0.4, "linestyle": "none"}
-            axis.plot(*graph.xy[use].T, marker, label=name, **style, **edge)
+            style = {"color": colour, "markersize": 4, "markeredgecolor": "white"}
+            style |= {"markeredgewidth": 0.4, "linestyle": "none", "zorder": 2}
+            axis.plot(graph.xy[use, 0], graph.xy[use, 1], marker, label=name, **style)

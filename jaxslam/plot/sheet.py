@@ -1,6 +1,6 @@
-"""Colours, and the sheets that everything is drawn on.
+"""Colours, figures, axes and legends of all plots.
 
-Colours are those of Okabe and Ito, which colour-blind people can tell apart.
+The palette is that of Okabe and Ito, which is safe for colour-blind readers.
 """
 
 import numpy as np
@@ -12,20 +12,20 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
     *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
 )
 GREY = "#8C8C8C"
-SIGMAS = 3.0  # standard deviations that ellipses and bounds show
+SIGMAS = 3.0  # standard deviations that ellipses and bounds are drawn at
 
 
 def canvas(
     width: float, height: float, rows: int = 1, columns: int = 1
 ) -> tuple[Figure, np.ndarray]:
-    """Figure of a size [inch], 100 dots to the inch, and its axes (rows, columns)."""
+    """Figure of a size [inch] at 100 dots per inch, and its axes (rows, columns)."""
     figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
     shared = "col" if rows > 1 else False
     return figure, figure.subplots(rows, columns, squeeze=False, sharex=shared)
 
 
 def plan(low: np.ndarray, high: np.ndarray) -> tuple[Figure, Axes]:
-    """Figure 900 dots wide of the rectangle from `low` (2,) to `high` (2,) [m, world]."""
+    """Figure 900 dots wide, of the rectangle from `low` (2,) to `high` (2,) [m, world frame]."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     margin = 0.03 * np.max(high - low) + 0.2
     low, high = low - margin, high + margin
@@ -38,12 +38,12 @@ def plan(low: np.ndarray, high: np.ndarray) -> tuple[Figure, Axes]:
 
 
 def extent(*groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x, y (2,) [m] of groups of points (N, 2) or poses (N, 3)."""
+    """Bounding box, lowest and highest x, y (2,) [m], of points (N, 2) or poses (N, 3)."""
     points = np.concatenate([np.asarray(group)[:, :2] for group in groups])
     points = points[np.isfinite(points).all(axis=1)]
     return points.min(axis=0), points.max(axis=0)
 
 
 def legend(figure: Figure) -> None:
-    """Put one legend below all that is drawn."""
+    """Add one legend below all axes of a figure."""
     figure.legend(loc="outside lower center", ncols=4, frameon=False)

@@ -155,7 +155,7 @@ def test_what_is_known_beforehand_is_checked(bad):
         "asymmetric": r"cov\[2\] is not symmetric: \[0, 1\] is 0.5, \[1, 0\] 0",
         "indefinite": r"cov\[2\] is not positive definite: its smallest eigenvalue is -1",
         "nan": r"cov\[2\] holds numbers that are not finite",
-        "too many": "5 places for a map of 4 landmarks",
+        "too many": "5 positions for a map of 4 landmarks",
     }
     blank = initial(jnp.zeros(3), landmarks=4 if bad == "too many" else L)
     with pytest.raises(ValueError, match=told[bad]):

@@ -10,15 +10,29 @@ from pathlib import Path
 import jax
 
 from experiments import common
-from jaxslam import monte_carlo, slam
-from jaxslam.batches import use_cores
-from jaxslam.motion import Robot
-from jaxslam.types import NODE
+from jaxslam.core.devices import use_cpu_devices
+from jaxslam.core.types import JUNCTION
+from jaxslam.evaluation import summary
+from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.pipeline.config import Config
 
 ROWS = {
-    "nodes_codes": slam.Config(labels="codes", kinds=(NODE,)),
-    "nodes_runs": slam.Config(kinds=(NODE,)),
-    "all": slam.Config(),
+    "nodes_codes": Config(
+        frontend=FrontendConfig(
+            labels="codes",
+        ),
+        filter=FilterConfig(
+            landmark_kinds=(JUNCTION,),
+        ),
+    ),
+    "nodes_runs": Config(
+        filter=FilterConfig(
+            landmark_kinds=(JUNCTION,),
+        ),
+    ),
+    "all": Config(),
 }
 KEPT = ("position_rmse_m", "heading_rmse_deg", "nees", "diverged", "runs")
 
@@ -27,8 +41,8 @@ def compute(seed: int, runs: int) -> common.Numbers:
     """Errors of every baseline over the same runs."""
     rows = []
     for name, config in ROWS.items():
-        tracks = common.many(jax.random.key(seed), config, slam.wheel_noise(Robot()), runs)
-        found = monte_carlo.evaluate(tracks)
+        tracks = common.many(jax.random.key(seed), config, NoiseParams.for_simulated_robot(), runs)
+        found = summary.evaluate(tracks)
         rows.append({"name": name} | {key: found[key] for key in KEPT})
         blind = found["dead_reckoning"] | {"nees": None, "runs": runs}
     return {"seed": seed, "rows": [{"name": "dead_reckoning"} | blind, *rows]}
@@ -56,8 +70,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the experiment, and print its table."""
     given = common.parse(__doc__, argv, runs=100)
-    use_cores()
-    numbers = compute(given.seed, given.runs)
+    use_cpu_devices()
+    numbers = compute(given.seed, given.frontend.segments)
     common.save(given.out, "baselines", numbers, draw)
     print(f"{'':16}position  heading   NEES  diverged")
     for row in numbers["rows"]:

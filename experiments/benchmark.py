@@ -17,38 +17,57 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from experiments import common, estimator, filters, peers
 from experiments.one_core import least, pin, seconds
-from jaxslam import edges, junctions, monte_carlo, nodes, slam, voronoi
-from jaxslam.batches import map_batches
-from jaxslam.grid import seen_free
-from jaxslam.lidar import Scan, cast
+from jaxslam.core.batching import map_batches
+from jaxslam.core.episode import Episode
+from jaxslam.core.features import Features
+from jaxslam.core.scan import Scan
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import (
+    automaton,
+    extract,
+    features,
+    junctions,
+    segmentation,
+    segments,
+    voronoi,
+)
+from jaxslam.frontend.automaton import Fronts
+from jaxslam.frontend.grid import seen_free
+from jaxslam.frontend.segments import Segments
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import trials
+from jaxslam.simulation.ray_casting import cast
 
 LOOKED_AT = 512  # scans at most that the front end is timed on
 
 
 def batched(function: Callable) -> Callable:
-    """`function` of one item, compiled for many, as everywhere in batches of `slam.BATCH`."""
-    return jax.jit(lambda *items: map_batches(lambda x: function(*x), items, size=slam.BATCH))
+    """`function` of one item, compiled for many, as everywhere in batches of `SCAN_BATCH`."""
+    return jax.jit(
+        lambda *items: map_batches(lambda x: function(*x), items, batch_size=extract.SCAN_BATCH)
+    )
 
 
 def chain(seed: int, runs: int, repeats: int) -> tuple[common.Numbers, Scan]:
     """Scans a second of the chain, and the milliseconds a scan of its parts; and its scans."""
-    config = slam.Config()
+    config = Config()
     place, robot, path, steps = common.scene()
-    noise = slam.wheel_noise(robot)
-    keys = monte_carlo.run_keys(jax.random.key(seed), np.arange(runs))
+    noise = NoiseParams.for_simulated_robot(*robot)
+    keys = trials.trial_keys(jax.random.key(seed), np.arange(runs))
 
-    def simulate(keys: jax.Array) -> monte_carlo.Log:
-        return monte_carlo.simulate_keys(keys, config, place, robot, path, steps=steps)
+    def simulate(keys: jax.Array) -> Episode:
+        return trials.simulate_keys(keys, config, robot, place, path, num_scans=steps)
 
     logs = simulate(keys)
     poses = logs.truth.reshape(-1, 3)
-    see = batched(lambda pose: cast(place, pose, config.lidar))
+    see = batched(lambda pose: cast(config.frontend.lidar, place, pose))
     scans = see(poses)
     calls = {
-        "chain": (lambda k: monte_carlo.tracks(config, noise, simulate(k)), keys),
+        "chain": (lambda k: episodes.filter_episodes(config, noise, simulate(k)), keys),
         "ray_casting": (see, poses),
-        "front_end": (batched(partial(slam.front_end, config)), scans),
-        "filter": (lambda logs: monte_carlo.tracks(config, noise, logs), logs),
+        "front_end": (batched(partial(extract.extract_features, config.frontend)), scans),
+        "filter": (lambda logs: episodes.filter_episodes(config, noise, logs), logs),
     }
     taken = least(calls, repeats=repeats)
     count = runs * steps
@@ -62,24 +81,28 @@ def chain(seed: int, runs: int, repeats: int) -> tuple[common.Numbers, Scan]:
     return numbers, jax.tree.map(lambda x: x[:LOOKED_AT], scans)
 
 
-def stages(config: slam.Config, scans: Scan) -> dict[str, tuple]:
-    """The stages of `slam.look` with run labels: what each does to all scans, and its inputs."""
-    lidar, grid, spec = config.lidar, config.grid, config.nodes
+def stages(config: Config, scans: Scan) -> dict[str, tuple]:
+    """The stages of `extract.extract_diagram` with run labels: what each does to all scans, and its inputs."""
+    lidar, grid, spec = config.frontend.lidar, config.frontend.grid, config.frontend.features
 
-    def cells(scan: Scan, runs: edges.Runs) -> tuple[jax.Array, jax.Array]:
-        own = edges.run_cells(scan, lidar, runs, grid)
-        return own, slam.start_of(own, seen_free(scan, lidar, grid))
+    def cells(scan: Scan, runs: Segments) -> tuple[jax.Array, jax.Array]:
+        own = segments.segment_cells(lidar, grid, scan, runs)
+        return own, extract.segment_fronts(own, seen_free(lidar, grid, scan))
 
-    def found(own: jax.Array, fronts: voronoi.Fronts, scan: Scan, runs: edges.Runs) -> Any:
-        near = voronoi.crowded(fronts, own >= 0)
-        return junctions.find_junctions(near, scan, runs, lidar, grid, spec)
+    def found(own: jax.Array, fronts: Fronts, scan: Scan, runs: Segments) -> Any:
+        near = voronoi.junction_cells_of_fronts(fronts, own >= 0)
+        return junctions.find_junctions(lidar, grid, spec, near, scan, runs)
 
-    def others(runs: edges.Runs) -> tuple[nodes.Nodes, nodes.Nodes]:
-        return nodes.find_corners(runs, spec), nodes.find_walls(runs, spec)
+    def others(runs: Segments) -> tuple[Features, Features]:
+        return features.find_corners(spec, runs), features.find_wall_directions(spec, runs)
 
-    runs_of = batched(lambda scan: edges.runs(scan, lidar, config.runs))
+    runs_of = batched(
+        lambda scan: segmentation.find_segments(lidar, config.frontend.segments, scan)
+    )
     cells_of = batched(cells)
-    grow = batched(partial(voronoi.grow, steps=config.steps, octagon=True))
+    grow = batched(
+        partial(automaton.expand_fronts, steps=config.frontend.automaton_steps, octagon=True)
+    )
     runs = runs_of(scans)
     own, start = cells_of(scans, runs)
     return {
@@ -91,14 +114,18 @@ def stages(config: slam.Config, scans: Scan) -> dict[str, tuple]:
     }
 
 
-def compile_seconds(config: slam.Config, scans: Scan) -> float:
+def compile_seconds(config: Config, scans: Scan) -> float:
     """Seconds to trace and compile the front end, nothing of it kept from before."""
     kept = jax.config.jax_enable_compilation_cache
     jax.config.update("jax_enable_compilation_cache", False)
     compilation_cache.reset_cache()
     jax.clear_caches()
     try:
-        return seconds(lambda: batched(partial(slam.front_end, config)).lower(scans).compile())
+        return seconds(
+            lambda: (
+                batched(partial(extract.extract_features, config.frontend)).lower(scans).compile()
+            )
+        )
     finally:
         jax.config.update("jax_enable_compilation_cache", kept)
         compilation_cache.reset_cache()
@@ -106,14 +133,14 @@ def compile_seconds(config: slam.Config, scans: Scan) -> float:
 
 def front_end(scans: Scan, maps: int, repeats: int) -> common.Numbers:
     """Speed of the front end and its stages on given scans, and of the automaton by itself."""
-    config = slam.Config()
-    whole = batched(partial(slam.front_end, config))
+    config = Config()
+    whole = batched(partial(extract.extract_features, config.frontend))
     parts = stages(config, scans)
     taken = least({"whole": (whole, scans)} | parts, repeats=repeats)
     total, count = sum(taken[name] for name in parts), len(scans.ranges)
     return {
-        "beams": config.lidar.beams,
-        "labels": config.labels,
+        "beams": config.frontend.lidar.num_beams,
+        "labels": config.frontend.labels,
         "scans": count,
         "scans_per_s": count / taken["whole"],
         "ms_per_scan": {name: 1e3 * s / count for name, s in taken.items()},
@@ -175,7 +202,7 @@ def main(argv: list[str] | None = None) -> None:
     """Run the benchmark."""
     pin()
     given = common.parse(__doc__, argv, runs=4, maps=256, drives=512, repeats=3)
-    numbers = compute(given.seed, given.runs, given.maps, given.drives, given.repeats)
+    numbers = compute(given.seed, given.frontend.segments, given.maps, given.drives, given.repeats)
     common.save(given.out, "benchmark", numbers, draw)
     of_chain, of_front = numbers["chain"], numbers["front_end"]
     percent = lambda shares: {name: f"{100 * share:.0f} %" for name, share in shares.items()}

@@ -13,11 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import programs, slam, voronoi, world
-from jaxslam.grid import GridSpec, centres
+from jaxslam.core import trace_cache
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import extract, voronoi
+from jaxslam.frontend.automaton import Diagram
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.grid import GridSpec, centres
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import plain, write_json
-from jaxslam.lidar import Lidar, Scan, cast
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import worlds
+from jaxslam.simulation.ray_casting import cast
+from jaxslam.simulation.worlds import World
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
     *("#000000", "#E69F00", "#56B4E9", "#009E73"),
@@ -31,7 +39,7 @@ NAMES = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJ"  # of the labels, in the order of
 Numbers = dict[str, Any]
 """Results of an experiment: dicts, lists, numbers and strings."""
 
-GRID = GridSpec(ahead=7.95, behind=0.25, side=8.05)
+GRID = GridSpec(x_max=7.95, x_min=-0.25, y_half=8.05)
 """Grid whose cells have their centres on multiples of 0.1 m, where the worlds have their walls."""
 
 Window = tuple[float, float, float, float]
@@ -85,7 +93,7 @@ class Kept:
     def __init__(self, folder: Path, about: Any):
         """Keep parts in `folder`; those of another program, or `about` something else, are not."""
         self._folder = folder
-        self._about = f"{about!r}, {programs.version()}"
+        self._about = f"{about!r}, {trace_cache.version()}"
 
     def __call__(self, name: str, make: Callable[[], Numbers]) -> Numbers:
         """What `make` returns, as JSON has it: made now, or by an earlier call."""
@@ -136,20 +144,25 @@ def plain_log(axis) -> None:
 
 def scan_of(name: str, lidar: Lidar) -> Scan:
     """Noise-free scan of the world `name` from its origin."""
-    walls = jnp.asarray(world.named(name).walls, float)
-    return cast(world.World(walls), jnp.zeros(3), lidar)
+    walls = jnp.asarray(worlds.named(name).walls, float)
+    return cast(lidar, World(walls), jnp.zeros(3))
 
 
 @partial(jax.jit, static_argnums=0)
-def _diagram(config: slam.Config, scan: Scan) -> tuple[voronoi.Diagram, jnp.ndarray]:
+def _diagram(config: Config, scan: Scan) -> tuple[Diagram, jnp.ndarray]:
     """Diagram and source cells of a scan; the landmarks are not even compiled."""
-    return slam.look(config, scan)[1:]
+    return extract.extract_diagram(config.frontend, scan)[1:]
 
 
-def look(name: str, mode: str) -> tuple[voronoi.Diagram, np.ndarray]:
+def look(name: str, mode: str) -> tuple[Diagram, np.ndarray]:
     """Diagram of the world `name` as seen from its origin, and its source cells (H, W)."""
-    config = slam.Config(labels=mode, grid=GRID)
-    diagram, sources = _diagram(config, scan_of(name, config.lidar))
+    config = Config(
+        frontend=FrontendConfig(
+            labels=mode,
+            grid=GRID,
+        ),
+    )
+    diagram, sources = _diagram(config, scan_of(name, config.frontend.lidar))
     return diagram, np.asarray(sources)
 
 
@@ -173,9 +186,9 @@ def text_of(labels: np.ndarray, branch: np.ndarray) -> list[str]:
     ]
 
 
-def picture(diagram: voronoi.Diagram, sources: np.ndarray, window: Window) -> Numbers:
+def picture(diagram: Diagram, sources: np.ndarray, window: Window) -> Numbers:
     """Regions and branches, and sources, of a diagram as lines of text, x and y ascending."""
-    labels, branch = np.asarray(diagram.labels), np.asarray(voronoi.branches(diagram, sources))
+    labels, branch = np.asarray(diagram.labels), np.asarray(voronoi.branch_cells(diagram, sources))
     regions, none = np.where(sources, 0, labels), np.zeros_like(sources)
     seeds = np.where(sources, labels, 0)
     return {
@@ -214,12 +227,12 @@ def draw_picture(axis, drawn: Numbers) -> None:
 
 def scene(name: str = "office"):
     """World, robot, path (N, 2) and number of scans of the drive in a world."""
-    from jaxslam import monte_carlo, plan
-    from jaxslam.motion import Robot
+    from jaxslam.simulation import drives, path_following
+    from jaxslam.simulation.robot import Robot
 
-    robot, path = Robot(), jnp.asarray(plan.densify(world.drive(name)), float)
-    place = world.World(jnp.asarray(world.named(name).walls, float))
-    return place, robot, path, monte_carlo.drive_steps(robot, path)
+    robot, path = Robot(), jnp.asarray(path_following.densify(worlds.waypoints(name)), float)
+    place = World(jnp.asarray(worlds.named(name).walls, float))
+    return place, robot, path, drives.num_scans_of_drive(robot, path)
 
 
 def part(runs: Any, chosen: Any) -> Any:
@@ -227,18 +240,19 @@ def part(runs: Any, chosen: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[chosen], runs)
 
 
-def many(key, config: slam.Config, noise: slam.Noise, runs: int, name: str = "office"):
+def many(key, config: Config, noise: NoiseParams, runs: int, name: str = "office"):
     """Tracks of B runs of the drive in a world, with a progress bar."""
     from tqdm import tqdm
 
-    from jaxslam import monte_carlo
+    from jaxslam.pipeline import episodes
+    from jaxslam.simulation import trials
 
     place, robot, path, steps = scene(name)
     parts = []
     with tqdm(total=runs, unit="run", leave=False) as bar:
-        for part in monte_carlo.experiment(
-            key, config, noise, place, robot, path, runs=runs, steps=steps
+        for part in trials.run_trials(
+            key, config, robot, noise, place, path, num_trials=runs, num_scans=steps
         ):
             parts.append(part)
             bar.update(len(part.finite))
-    return monte_carlo.collect(parts)
+    return episodes.concatenate_results(parts)

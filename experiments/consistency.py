@@ -17,8 +17,8 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import common, workload
-from jaxslam.ekf import LINEARISATIONS
-from jaxslam.metrics import nees, pose_error
+from jaxslam.evaluation.consistency import nees, pose_error
+from jaxslam.filtering.ekf import LINEARISATIONS
 
 NOISE = ((1.0, 1.0), (2.0, 1.5), (4.0, 3.0))  # factors on odometry and sensor noise
 SKIP = 10  # steps at the start of the circle whose NEES counts as zero, as UKF-M has it
@@ -37,7 +37,7 @@ def row(setting: str, linearisation: str, drive: workload.Drive, of_rate: bool) 
     """Errors of one linearisation on all runs of a drive, with standard errors over the runs."""
     steps = workload.filtered(linearisation, workload.as_floats(drive))
     steps = type(steps)(*(np.asarray(x, float) for x in steps))
-    error = np.asarray(pose_error(jnp.asarray(steps.pose), jnp.asarray(drive.truth)))
+    error = np.asarray(pose_error(jnp.asarray(steps.last_pose), jnp.asarray(drive.truth)))
     first = SKIP if of_rate else 0
     joint = np.asarray(nees(jnp.asarray(error), jnp.asarray(steps.cov)))[:, first:] / 3
     place = np.sum(error[..., :2] ** 2, axis=-1)
@@ -108,7 +108,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
     given = common.parse(__doc__, argv, runs=1000, circle_runs=500)
-    numbers = compute(given.seed, given.runs, given.circle_runs)
+    numbers = compute(given.seed, given.frontend.segments, given.circle_runs)
     common.save(given.out, "consistency", numbers, draw)
     for r in numbers["rows"]:
         print(

@@ -28,12 +28,19 @@ from experiments import filters, peers, workload
 from experiments.common import Numbers, scene
 from experiments.one_core import least, pin, seconds, unpin
 from experiments.workload import TOGETHER, Drive, Steps
-from jaxslam import monte_carlo, slam
-from jaxslam.batches import map_batches
-from jaxslam.lidar import cast
-from jaxslam.motion import Robot
-from jaxslam.nodes import Nodes
-from jaxslam.types import Array
+from jaxslam.core.batching import map_batches
+from jaxslam.core.episode import Episode
+from jaxslam.core.features import Features
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.types import Array
+from jaxslam.filtering import slam_filter
+from jaxslam.filtering.config import init
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import extract
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import trials
+from jaxslam.simulation.ray_casting import cast
 
 YARDSTICK = peers.YARDSTICK.with_name("ekf_limit.c")
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,19 +55,19 @@ WHOLE = "--xla_disable_hlo_passes=cpu-parallel-task-assigner"
 def assumed(std: Array, run: Drive) -> Drive:
     """The run, with noise of standard deviations (5,): odometry x, y, heading; range, bearing."""
     r = jnp.broadcast_to(jnp.diag(std[3:] ** 2), run.r.shape)
-    return run._replace(q=jnp.diag(std[:3] ** 2), r=r)
+    return run._replace(odometry_cov=jnp.diag(std[:3] ** 2), measurement_cov=r)
 
 
 def track(std: Array, run: Drive) -> Array:
     """Positions (T, 2) of one run whose landmarks are all known."""
-    return workload.filter_one("standard", assumed(std, run), grows=False).pose[:, :2]
+    return workload.filter_one("standard", assumed(std, run), grows=False).last_pose[:, :2]
 
 
 @jax.jit
 def filtered(drive: Drive) -> Steps:
     """Filter B runs whose landmarks are all known, a few together."""
     one = partial(workload.filter_one, "standard", grows=False)
-    return map_batches(one, drive, size=TOGETHER)
+    return map_batches(one, drive, batch_size=TOGETHER)
 
 
 @jax.jit
@@ -111,26 +118,30 @@ def speed(seed: int, runs: int, repeats: int) -> Numbers:
     }
 
 
-def latency(seed: int, runs: int) -> tuple[Numbers, monte_carlo.Log]:
+def latency(seed: int, runs: int) -> tuple[Numbers, Episode]:
     """Milliseconds of one step and of one front end at a time, late in a drive; logs of B drives.
 
     The step has 64 slots for landmarks, whatever of them the drive has filled so far.
     """
-    config = slam.Config()
+    config = Config()
     place, robot, path, steps = scene()
-    keys = monte_carlo.run_keys(jax.random.key(seed), np.arange(runs))
-    logs = monte_carlo.simulate_keys(keys, config, place, robot, path, steps=steps)
+    keys = trials.trial_keys(jax.random.key(seed), np.arange(runs))
+    logs = trials.simulate_keys(keys, config, robot, place, path, num_scans=steps)
     log = jax.tree.map(lambda x: x[0], logs)
-    small = config._replace(landmarks=64)
-    known, belief = slam.wheel_noise(robot), slam.init(small, log.truth[0])
-    step, see = jax.jit(slam.step, static_argnums=0), jax.jit(cast, static_argnums=2)
-    look = jax.jit(slam.front_end, static_argnums=0)
+    small = config._replace(
+        filter=config.filter._replace(
+            max_landmarks=64,
+        ),
+    )
+    known, belief = NoiseParams.for_simulated_robot(*robot), init(small.filter, log.truth[0])
+    step, see = jax.jit(slam_filter.step, static_argnums=0), jax.jit(cast, static_argnums=2)
+    look = jax.jit(extract.extract_features, static_argnums=0)
     first, of_step, of_look = steps - CALLS, [], []
     for k in range(steps):
-        now = jax.tree.map(lambda x, k=k: x[k], slam.Inputs(log.motion, log.nodes))
+        now = jax.tree.map(lambda x, k=k: x[k], Measurement(log.odometry, log.features))
         jax.block_until_ready((now, belief))
         if k >= first:
-            scan = jax.block_until_ready(see(place, log.truth[k], config.lidar))
+            scan = jax.block_until_ready(see(place, log.truth[k], config.frontend.lidar))
             seconds(look, config, scan)  # the first call compiles
             of_look.append(seconds(look, config, scan))
             of_step.append(seconds(step, small, known, belief, now))
@@ -138,7 +149,7 @@ def latency(seed: int, runs: int) -> tuple[Numbers, monte_carlo.Log]:
     return {
         "step_ms": 1e3 * statistics.median(of_step),
         "front_end_ms": 1e3 * statistics.median(of_look),
-        "step_landmarks": int(np.count_nonzero(belief.seen)),
+        "step_landmarks": int(np.count_nonzero(belief.num_seen)),
     }, logs
 
 
@@ -195,7 +206,7 @@ def devices(seed: int, runs: int, repeats: int, pinned: bool) -> Numbers:
     pin() if pinned else unpin()
     call, drive = sharded(workload.as_floats(workload.rings(seed, runs)))
     taken = least({"": (call, drive)}, repeats=repeats)[""]
-    ends = np.asarray(call(drive).pose)[:, -1]
+    ends = np.asarray(call(drive).last_pose)[:, -1]
     return {"devices": jax.device_count(), "seconds": taken, "ends": ends.tolist()}
 
 
@@ -230,18 +241,18 @@ def precision(seed: int, runs: int, beside: int, logs: str) -> Numbers:
         logs: File with the arrays of the office's logs, whose features both are given.
     """
     pin()
-    config, known = slam.Config(), slam.wheel_noise(Robot())
+    config, known = Config(), NoiseParams.for_simulated_robot()
     with np.load(logs) as kept:
         truth, motion, *nodes = (kept[name] for name in kept)
-    logs = monte_carlo.Log(truth, motion, Nodes(*nodes))
+    logs = Episode(truth, motion, Features(*nodes))
     rings = workload.rings(seed, runs)
-    single = filtered(workload.as_floats(rings)).pose
-    single_office = monte_carlo.tracks(config, known, logs)
+    single = filtered(workload.as_floats(rings)).last_pose
+    single_office = episodes.filter_episodes(config, known, logs)
     single, single_office, known = jax.tree.map(np.asarray, (single, single_office, known))
     jax.config.update("jax_enable_x64", True)
-    double = filtered(workload.as_floats(rings, np.float64)).pose
+    double = filtered(workload.as_floats(rings, np.float64)).last_pose
     wide = lambda x: jnp.asarray(x.astype(float) if np.issubdtype(x.dtype, np.floating) else x)
-    double_office = monte_carlo.tracks(config, *jax.tree.map(wide, (known, logs)))
+    double_office = episodes.filter_episodes(config, *jax.tree.map(wide, (known, logs)))
     told = {
         "max_difference_f32_m": farthest(single, double),
         "max_difference_f32_office_m": farthest(single_office.estimate, double_office.estimate),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import BLACK, ORANGE, SKY, Numbers, canvas, parse, save
-from jaxslam.voronoi import expand
+from jaxslam.frontend.automaton import expand
 
 STEPS = 3
 

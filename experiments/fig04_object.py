@@ -23,10 +23,10 @@ from experiments.common import (
     save,
     scan_of,
 )
-from jaxslam.edges import codes
-from jaxslam.grid import centres, rasterise
-from jaxslam.lidar import Lidar
-from jaxslam.voronoi import block_union, branches
+from jaxslam.core.scan import Lidar
+from jaxslam.frontend.edge_codes import edge_codes
+from jaxslam.frontend.grid import centres, rasterise
+from jaxslam.frontend.voronoi import block_union, branch_cells
 
 WINDOW = (-0.25, 3.25, -2.25, 2.25)
 FRONT = (1.35, 1.45, 0.45, 0.85)  # the face of the box across the sensor axis
@@ -53,7 +53,7 @@ def between_faces(diagram, sources: np.ndarray) -> Numbers:
     near = np.asarray(block_union(np.where(sources, 0, labels)))
     x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
     close = np.hypot(x - CORNER[0] - 0.05, y - CORNER[2] - 0.05) < 1.0
-    branch = np.asarray(branches(diagram, sources)) & close
+    branch = np.asarray(branch_cells(diagram, sources)) & close
     touching = lambda *parts: int((branch & np.all([near & p != 0 for p in parts], axis=0)).sum())
     direct, first, second = touching(front, side), touching(front, corner), touching(corner, side)
     return {
@@ -68,7 +68,7 @@ def between_faces(diagram, sources: np.ndarray) -> Numbers:
 def compute() -> Numbers:
     """Codes of the cells, and in each mode the diagram and the branch between the faces."""
     lidar = Lidar()
-    code = codes(rasterise(scan_of("fig04", lidar), lidar, GRID), GRID)
+    code = edge_codes(GRID, rasterise(lidar, GRID, scan_of("fig04", lidar)))
     seen = {mode: look("fig04", mode) for mode in ("codes", "runs")}
     digits = lambda row: "".join(str(c) if c else "." for c in row)
     return {

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import label
 
 from experiments.common import GRID, Numbers, canvas, draw_picture, look, parse, picture, save
-from jaxslam.grid import centres
-from jaxslam.voronoi import branches, junctions
+from jaxslam.frontend.grid import centres
+from jaxslam.frontend.voronoi import branch_cells, junction_cells
 
 WINDOW = (-0.25, 6.05, -2.25, 2.25)
 MEASURED = (0.25, 4.75)  # [m] along x
@@ -19,7 +19,7 @@ WORLDS = {
     "fig06c": "(c) a column",
     "fig06d": "(d) uneven walls",
 }
-CELL = GRID.cell
+CELL = GRID.cell_size
 
 
 def measure(diagram, sources: np.ndarray) -> Numbers:
@@ -30,7 +30,7 @@ def measure(diagram, sources: np.ndarray) -> Numbers:
     """
     x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
     inside = (x > MEASURED[0]) & (x < MEASURED[1]) & (np.abs(y) < HALF)
-    branch = np.asarray(branches(diagram, sources)) & inside
+    branch = np.asarray(branch_cells(diagram, sources)) & inside
     profile, at, beside = [], 0.0, 0
     for row in np.flatnonzero(branch.any(axis=1)):
         cells = y[row, branch[row]]
@@ -45,7 +45,7 @@ def measure(diagram, sources: np.ndarray) -> Numbers:
         "pieces": int(label(branch, np.ones((3, 3)))[1]),
         "side_branch_cells": beside,
         "junctions": int(
-            label(np.asarray(junctions(diagram, sources)) & inside, np.ones((3, 3)))[1]
+            label(np.asarray(junction_cells(diagram, sources)) & inside, np.ones((3, 3)))[1]
         ),
     }
 

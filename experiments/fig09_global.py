@@ -5,7 +5,7 @@ odometry, and adds the local map of each scan to the global one. The map at the 
 with the Voronoi graph of the full room, which is made from its walls, without a robot.
 
 Ten scans see most junctions once or twice, so that here a landmark counts from its first sighting
-(`confirm=1`) and is trusted sooner (`nodes`), which leaves it up to 6 cm off, as the filter is told
+(`confirm=1`) and is trusted sooner (`features`), which leaves it up to 6 cm off, as the filter is told
 (`RANGE`, `BEARING`); two junctions of the room are 0.25 m apart, so that `apart` is less than that.
 The ten places were chosen for what can be seen from them: JSON also says what other draws of the
 noise give, and what places do that are moved a little.
@@ -19,19 +19,36 @@ from scipy.optimize import linear_sum_assignment
 from experiments.common import Numbers, parse, save
 from experiments.fig09_picture import draw
 from experiments.room_graph import reference
-from jaxslam import slam, topomap, ways, world
-from jaxslam.geometry import between, to_world
-from jaxslam.grid import centres
-from jaxslam.lidar import cast, disturb
-from jaxslam.motion import Robot, process_noise, wheel_coefficients
-from jaxslam.nodes import NodeSpec
-from jaxslam.recognition import MatchSpec
-from jaxslam.types import NODE
-from jaxslam.voronoi import branches
+from jaxslam.core import polylines
+from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.se2 import relative, transform
+from jaxslam.core.types import JUNCTION
+from jaxslam.filtering import config, slam_filter
+from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.data_association import AssociationSpec
+from jaxslam.filtering.motion_model import odometry_cov, wheel_coefficients
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import extract, voronoi
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.features import FeatureSpec
+from jaxslam.frontend.grid import centres
+from jaxslam.mapping import arc_table, topological_map
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import worlds
+from jaxslam.simulation.ray_casting import add_range_noise, cast
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.worlds import World
 
 WORLD = "fig07"
-CONFIG = slam.Config(
-    confirm=1, matching=MatchSpec(apart=0.15), nodes=NodeSpec(seen=0.5, hidden=0.3)
+CONFIG = Config(
+    filter=FilterConfig(
+        confirm_count=1,
+        association=AssociationSpec(min_separation=0.15),
+    ),
+    frontend=FrontendConfig(
+        features=FeatureSpec(min_seen_fraction=0.5, max_hidden_depth=0.3),
+    ),
 )
 RANGE, BEARING = 0.02, 0.01  # [m], [rad] standard deviation of nodes beyond their own
 NEAR = 0.1  # [m] a node of the map this close to a junction is that junction
@@ -41,8 +58,8 @@ SHIFT = (0.05, 0.05, 0.05)  # [m, m, rad] standard deviation of places that are 
 @jax.jit
 def scans_from(poses: jax.Array, walls: jax.Array, key: jax.Array):
     """Noisy scans [T] of the walls (S, 4) from poses (T, 3)."""
-    look = lambda pose, own: disturb(
-        own, cast(world.World(walls), pose, CONFIG.lidar), CONFIG.lidar
+    look = lambda pose, own: add_range_noise(
+        own, CONFIG.frontend.lidar, cast(CONFIG.frontend.lidar, World(walls), pose)
     )
     return jax.vmap(look)(poses, jax.random.split(key, poses.shape[0]))
 
@@ -51,14 +68,14 @@ def odometry(places: np.ndarray, robot: Robot, seed: int) -> np.ndarray:
     """What the encoders say (T, 3) of the way between successive places (T, 3)."""
     told, random = [np.zeros(3)], np.random.default_rng(seed)
     for a, b in zip(jnp.asarray(places[:-1], float), jnp.asarray(places[1:], float), strict=True):
-        motion = between(a, b)
-        cov = np.asarray(process_noise(wheel_coefficients(robot), motion), np.float64)
+        motion = relative(a, b)
+        cov = np.asarray(odometry_cov(wheel_coefficients(*robot), motion), np.float64)
         told.append(random.multivariate_normal(np.asarray(motion), (cov + cov.T) / 2))
     return np.array(told)
 
 
-step = jax.jit(slam.step, static_argnums=0)
-add = jax.jit(topomap.add, static_argnames="lidar")
+step = jax.jit(slam_filter.step, static_argnums=0)
+add = jax.jit(arc_table.add_scan_arcs, static_argnames="lidar")
 
 
 @jax.jit
@@ -66,8 +83,8 @@ def branch_cells(scans):
     """Cells [T] (H, W) bool of the branches of each local diagram."""
 
     def one(scan):
-        _, diagram, sources = slam.look(CONFIG, scan)
-        return branches(diagram, sources)
+        _, diagram, sources = extract.extract_diagram(CONFIG.frontend, scan)
+        return voronoi.branch_cells(diagram, sources)
 
     return jax.lax.map(one, scans)
 
@@ -83,38 +100,45 @@ def explore(
     """
     robot = Robot()
     poses = jnp.asarray(places, float)
-    noise = slam.wheel_noise(robot)._replace(
-        range=jnp.asarray(RANGE, float), bearing=jnp.asarray(BEARING, float)
+    noise = NoiseParams.for_simulated_robot(*robot)._replace(
+        range_std=jnp.asarray(RANGE, float), bearing_std=jnp.asarray(BEARING, float)
     )
     scans = scans_from(poses, jnp.asarray(walls, float), jax.random.key(seed))
     told = jnp.asarray(odometry(places, robot, seed), float)
-    seen, links = slam.local_maps(CONFIG, scans)
-    belief, arcs = slam.init(CONFIG, poses[0]), topomap.empty(arcs=2 * CONFIG.landmarks)
+    seen, links = extract.extract_local_graphs(CONFIG.frontend, scans)
+    belief, arcs = (
+        config.init(CONFIG.filter, poses[0]),
+        arc_table.empty_arcs(capacity=2 * CONFIG.filter.max_landmarks),
+    )
     maps, way = [], []
     for t in range(len(places)):
         nodes, branch, scan = jax.tree.map(lambda x, t=t: x[t], (seen, links, scans))
-        belief, info = step(CONFIG, noise, belief, slam.Inputs(told[t], nodes))
-        arcs = add(arcs, info.id, info.pose, branch, scan, lidar=CONFIG.lidar)
+        belief, info = step(CONFIG, noise, belief, Measurement(told[t], nodes))
+        arcs = add(arcs, info.id, info.pose, branch, scan, lidar=CONFIG.frontend.lidar)
         way.append(np.asarray(info.pose))
-        graph = topomap.graph(
-            belief, arcs, np.array(way), confirm=CONFIG.confirm, apart=CONFIG.matching.apart
+        graph = topological_map.build_map(
+            belief,
+            arcs,
+            np.array(way),
+            confirm_count=CONFIG.filter.confirm_count,
+            min_separation=CONFIG.filter.association.min_separation,
         )
         maps.append(plain_map(graph))
     return maps, np.array(way), (scans, seen, links)
 
 
-def plain_map(graph: topomap.Graph) -> Numbers:
+def plain_map(graph: TopologicalMap) -> Numbers:
     """Nodes and arcs of a map, without its corners."""
-    nodes = np.flatnonzero(graph.kind == NODE)
+    nodes = np.flatnonzero(graph.kind == JUNCTION)
     rank = {int(n): k for k, n in enumerate(nodes)}
     return {
         "id": graph.id[nodes],
         "xy": graph.xy[nodes].round(4),
         "clearance_m": graph.clearance[nodes].round(3),
-        "arcs": [[rank[a], rank[b]] for a, b in graph.pairs.tolist()],
-        "lines": [line.round(3) for line in graph.lines],
+        "arcs": [[rank[a], rank[b]] for a, b in graph.arc_ends.tolist()],
+        "lines": [line.round(3) for line in graph.arc_lines],
         "driven_only": np.isnan(graph.arc_clearance),
-        "length_m": graph.length.round(3),
+        "length_m": graph.arc_length.round(3),
         "arc_clearance_m": graph.arc_clearance.round(3),
         "frontiers": [line.round(3) for line in graph.frontiers],
     }
@@ -123,10 +147,10 @@ def plain_map(graph: topomap.Graph) -> Numbers:
 def local_views(way: np.ndarray, scans, seen, links) -> list[Numbers]:
     """What each scan adds, in the map's frame: branch cells, junctions and arcs between them."""
     cells, views = np.asarray(branch_cells(scans)), []
-    middle = np.asarray(centres(CONFIG.grid))
+    middle = np.asarray(centres(CONFIG.frontend.grid))
     for t, pose in enumerate(way):
-        place = lambda xy, pose=pose: np.asarray(to_world(jnp.asarray(pose), jnp.asarray(xy)))
-        keep = np.asarray(seen.valid[t] & (seen.kind[t] == NODE))
+        place = lambda xy, pose=pose: np.asarray(transform(jnp.asarray(pose), jnp.asarray(xy)))
+        keep = np.asarray(seen.valid[t] & (seen.kind[t] == JUNCTION))
         views.append(
             {
                 "branches": place(middle[cells[t]]).round(2),
@@ -150,7 +174,7 @@ def compare(found: Numbers, true: Numbers) -> Numbers:
     seen = {p for p, only in zip(named, found["driven_only"], strict=True) if not only}
     lines = dict(zip(map(tuple, true["arcs"]), map(np.array, true["lines"]), strict=True))
     off = [
-        np.max(ways.beside(np.array(line), lines[name])[0])
+        np.max(polylines.project(np.array(line), lines[name])[0])
         for name, line in zip(named, found["lines"], strict=True)
         if name in wanted & seen
     ]
@@ -213,7 +237,7 @@ def equal(result: Numbers) -> bool:
 
 def compute(seed: int, runs: int) -> Numbers:
     """The maps scan by scan, the reference, and how they compare."""
-    places, walls = world.places(WORLD), np.asarray(world.named(WORLD).walls)
+    places, walls = worlds.scan_poses(WORLD), np.asarray(worlds.named(WORLD).walls)
     true = reference(walls)
     maps, way, local = explore(places, walls, seed)
     result = compare(maps[-1], true)
@@ -241,7 +265,7 @@ def compute(seed: int, runs: int) -> Numbers:
 def main() -> None:
     """Run the experiment."""
     given = parse(__doc__, runs=12)
-    numbers = compute(given.seed, given.runs)
+    numbers = compute(given.seed, given.frontend.segments)
     save(given.out, "fig09_global", numbers, draw)
 
 

@@ -15,15 +15,24 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from experiments import common
-from jaxslam import lidar, monte_carlo, motion, plan, slam, topomap, ways
-from jaxslam.geometry import compose
-from jaxslam.metrics import pose_error
-from jaxslam.motion import Robot
-from jaxslam.types import NODE
+from jaxslam.core import se2
+from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.se2 import compose
+from jaxslam.core.types import JUNCTION
+from jaxslam.evaluation import summary
+from jaxslam.evaluation.consistency import pose_error
+from jaxslam.filtering import config, slam_filter
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import extract
+from jaxslam.mapping import arc_table, graph_arcs, routes, topological_map
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import drives, path_following, ray_casting
+from jaxslam.simulation.robot import Robot, true_increment
 
 POINTS = 2000  # of a path, filled up with its end
 STEPS = 380  # scans of a leg at most
-CONFIG = slam.Config()
+CONFIG = Config()
 
 
 def padded(path: np.ndarray) -> tuple[jnp.ndarray, jnp.ndarray]:
@@ -34,21 +43,23 @@ def padded(path: np.ndarray) -> tuple[jnp.ndarray, jnp.ndarray]:
 
 
 @partial(jax.jit, static_argnames="robot")
-def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief, arcs):
+def leg(key, robot: Robot, place, noise: NoiseParams, path, begin, truth, belief, arcs):
     """Look around, then follow `path` by the belief, from a true pose (3,)."""
 
     def step(now, given):
         truth, belief, arcs, at = now
         key, moves = given
         roll_key, scan_key = jax.random.split(key)
-        told, at = plan.follow(path, at, belief.pose)
+        told, at = path_following.pure_pursuit(path, at, belief.pose)
         told = jnp.where(moves, told, 0.0)
-        draws = jax.random.normal(roll_key, (monte_carlo.SUBSTEPS, 2), path.dtype)
-        truth = compose(truth, motion.roll(robot, draws, told))
-        scan = lidar.disturb(scan_key, lidar.cast(place, truth, CONFIG.lidar), CONFIG.lidar)
-        seen, links = slam.local_map(CONFIG, scan)
-        belief, info = slam.step(CONFIG, noise, belief, slam.Inputs(told, seen))
-        arcs = topomap.add(arcs, info.id, info.pose, links, scan, CONFIG.lidar)
+        draws = jax.random.normal(roll_key, (drives.SUBSTEPS, 2), path.dtype)
+        truth = compose(truth, true_increment(robot, draws, told))
+        scan = ray_casting.add_range_noise(
+            scan_key, CONFIG.frontend.lidar, ray_casting.cast(CONFIG.frontend.lidar, place, truth)
+        )
+        seen, links = extract.extract_local_graph(CONFIG.frontend, scan)
+        belief, info = slam_filter.step(CONFIG.filter, noise, belief, Measurement(told, seen))
+        arcs = arc_table.add_scan_arcs(CONFIG.frontend.lidar, arcs, info.id, info.pose, links, scan)
         return (truth, belief, arcs, at), (truth, told, info)
 
     start = (truth, belief, arcs, begin)
@@ -57,19 +68,19 @@ def leg(key, robot: Robot, place, noise: slam.Noise, path, begin, truth, belief,
     return truth, belief, arcs, truths, told, info
 
 
-def way_home(graph: topomap.Graph, trail: np.ndarray) -> np.ndarray:
+def way_home(graph: TopologicalMap, trail: np.ndarray) -> np.ndarray:
     """Shortest way (K, 2) back to where a trail (T, 2) began, over the largest part of the map.
 
     What lies between the map and the ends of the trail is known to be free along the trail alone.
     """
     size = len(graph.xy)
-    joined = coo_matrix((np.ones(len(graph.pairs)), graph.pairs.T), shape=(size, size))
+    joined = coo_matrix((np.ones(len(graph.arc_ends)), graph.arc_ends.T), shape=(size, size))
     part = connected_components(joined, directed=False)[1]
     largest = part == np.argmax(np.bincount(part))
     circles = np.where(largest, graph.clearance, 0.0)  # nothing is in a circle
-    at = np.array([ways.node_at(place, graph.xy, circles) for place in trail])
+    at = np.array([graph_arcs.node_at(place, graph.xy, circles) for place in trail])
     met = np.flatnonzero(at >= 0)
-    way = plan.route(graph, at[met[-1]], at[met[0]])
+    way = routes.find_route(graph, at[met[-1]], at[met[0]])
     return np.concatenate([trail[: met[-1] - 1 : -1], way.line, trail[met[0] :: -1]])
 
 
@@ -84,12 +95,12 @@ def clearance(walls: np.ndarray, places: np.ndarray) -> float:
 def compute(seed: int) -> common.Numbers:
     """Drive out and home; what happened, what the robot believed, and its map."""
     place, robot, tour, _ = common.scene()
-    noise, walls = slam.wheel_noise(robot), np.asarray(place.walls, float)
+    noise, walls = NoiseParams.for_simulated_robot(*robot), np.asarray(place.max_walls, float)
     out_key, home_key = jax.random.split(jax.random.key(seed))
-    first = monte_carlo.start(tour)
-    belief = slam.init(CONFIG, first)
+    first = drives.start_pose(tour)
+    belief = config.init(CONFIG.filter, first)
     truth, legs = first, []
-    arcs = topomap.empty(arcs=2 * CONFIG.landmarks)
+    arcs = arc_table.empty_arcs(capacity=2 * CONFIG.filter.max_landmarks)
     path, blind = np.asarray(tour), first
     for name, key in (("out", out_key), ("home", home_key)):
         truth, belief, arcs, truths, told, info = leg(
@@ -99,7 +110,7 @@ def compute(seed: int) -> common.Numbers:
         moved = 1 + int(np.argmax(still[1:])) if still[1:].any() else STEPS  # at the path's end
         cut = lambda tree: jax.tree.map(lambda x: x[:moved], tree)  # noqa: B023
         truths, told, info = cut((truths, told, info))
-        odometry = monte_carlo.dead_reckoning(blind, told)
+        odometry = se2.dead_reckoning(blind, told)
         error = np.asarray(pose_error(info.pose, truths))
         legs.append(
             {
@@ -110,7 +121,7 @@ def compute(seed: int) -> common.Numbers:
                 "odometry": odometry,
                 "scans": moved,
                 "length_m": float(np.linalg.norm(np.diff(truths[:, :2], axis=0), axis=1).sum()),
-                **monte_carlo.errors(error),
+                **summary.rmse_of(error),
                 "final_error_m": float(np.hypot(*error[-1, :2])),
                 "from_goal_m": float(np.hypot(*(np.asarray(truths)[-1, :2] - path[-1]))),
                 "odometry_final_error_m": float(np.hypot(*(odometry - truths)[-1, :2])),
@@ -118,9 +129,11 @@ def compute(seed: int) -> common.Numbers:
             }
         )
         poses = np.concatenate([np.asarray(one["estimate"]) for one in legs])
-        graph = topomap.graph(belief, arcs, poses, confirm=CONFIG.confirm)
+        graph = topological_map.build_map(
+            belief, arcs, poses, confirm_count=CONFIG.filter.confirm_count
+        )
         if name == "out":
-            path = plan.densify(way_home(graph, poses[:, :2]))
+            path = path_following.densify(way_home(graph, poses[:, :2]))
         blind = odometry[-1]
     return {"seed": seed, "legs": legs, "map": graph._asdict(), "walls": walls}
 
@@ -145,7 +158,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
         axis.plot(*estimate[:, :2].T, color=colour, linewidth=1.6, label=label)
         label = "true path" if one["leg"] == "home" else None
         axis.plot(*truth[:, :2].T, color=common.GREEN, linestyle=":", linewidth=2, label=label)
-    nodes = graph["kind"] == NODE
+    nodes = graph["kind"] == JUNCTION
     axis.plot(*graph["xy"][nodes].T, "o", color=common.RED, markersize=5, label="nodes")
     axis.plot(*graph["xy"][~nodes].T, "s", color=common.PINK, fillstyle="none", label="corners")
     odometry = np.concatenate([np.array(one["odometry"]) for one in numbers["legs"]])

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import common
-from jaxslam import metrics, monte_carlo, slam
-from jaxslam.batches import use_cores
-from jaxslam.motion import Robot
+from jaxslam.core.devices import use_cpu_devices
+from jaxslam.evaluation import consistency, summary
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline.config import Config
 
 SHOWN = 20  # runs drawn one by one
 NAMES = ("x_m", "y_m", "heading_deg")
@@ -18,22 +19,22 @@ UNIT = np.array([1.0, 1.0, 180.0 / np.pi])
 
 def compute(seed: int, runs: int) -> common.Numbers:
     """Errors per step over all runs, those of a few, and how consistent the filter is."""
-    tracks = common.many(jax.random.key(seed), slam.Config(), slam.wheel_noise(Robot()), runs)
-    error = metrics.pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth))
-    ratio = np.array(metrics.nees(error, jnp.asarray(tracks.cov)))[:, 1:]
+    tracks = common.many(jax.random.key(seed), Config(), NoiseParams.for_simulated_robot(), runs)
+    error = consistency.pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth))
+    ratio = np.array(consistency.nees(error, jnp.asarray(tracks.cov)))[:, 1:]
     error = np.asarray(error) * UNIT
     sigma = np.sqrt(np.diagonal(tracks.cov, axis1=-2, axis2=-1)) * UNIT
     inside = np.abs(error) <= 3 * sigma + 1e-9
     per_step = lambda values: {name: values[..., k].T for k, name in enumerate(NAMES)}
     return {
         "seed": seed,
-        **monte_carlo.evaluate(tracks),
+        **summary.evaluate(tracks),
         "rmse": per_step(np.sqrt(np.mean(error**2, axis=0))),
         "sigma": per_step(np.sqrt(np.mean(sigma**2, axis=0))),
         "within_3_sigma": {name: inside[..., k].mean() for k, name in enumerate(NAMES)},
         "largest": {name: np.abs(error[..., k]).max() for k, name in enumerate(NAMES)},
         "nees_per_step": np.mean(ratio, axis=0) / 3,
-        "nees_bounds_95": [b / 3 for b in metrics.chi_square_bounds(3, runs)],
+        "nees_bounds_95": [b / 3 for b in consistency.chi_square_bounds(3, runs)],
         "runs_shown": {name: error[:SHOWN, :, k] for k, name in enumerate(NAMES)},
     }
 
@@ -62,8 +63,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
     given = common.parse(__doc__, argv, runs=100)
-    use_cores()
-    numbers = compute(given.seed, given.runs)
+    use_cpu_devices()
+    numbers = compute(given.seed, given.frontend.segments)
     common.save(given.out, "fig13_errors", numbers, draw)
     print({key: numbers[key] for key in ("position_rmse_m", "heading_rmse_deg", "nees")})
     print("within 3 sigma:", numbers["within_3_sigma"])

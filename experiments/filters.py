@@ -17,8 +17,8 @@ import numpy as np
 from experiments.common import Numbers
 from experiments.one_core import least
 from experiments.workload import Drive, wrap
-from jaxslam.geometry import compose, wrap_angle
-from jaxslam.types import Array
+from jaxslam.core.se2 import compose, wrap_angle
+from jaxslam.core.types import Array
 
 STD = (0.02, 0.02, 0.01, 0.10, 0.03)  # of `workload.rings`: odometry x, y, heading; range, bearing
 POSE_STD = 1e-4  # of the first pose [m, rad]; factors of a covariance have no derivative at zero

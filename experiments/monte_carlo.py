@@ -31,12 +31,19 @@ from tqdm import tqdm
 from experiments import common, processes, scaling
 from experiments.estimator import peak
 from experiments.monte_carlo_picture import SHOWN, draw
-from jaxslam import metrics, monte_carlo, plan, programs, slam, world
-from jaxslam.batches import use_cores
+from jaxslam.core import trace_cache
+from jaxslam.core.devices import use_cpu_devices
+from jaxslam.evaluation import consistency
+from jaxslam.evaluation.summary import evaluate
+from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
-from jaxslam.monte_carlo import Track
-from jaxslam.motion import Robot
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.episodes import TrialResult
+from jaxslam.simulation import drives, path_following, trials, worlds
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.worlds import World
 
 NAME = "monte_carlo"
 KEPT = 64  # runs of a file of those that are done
@@ -48,7 +55,7 @@ class Case(NamedTuple):
     """What is driven, in what and how."""
 
     seed: int
-    config: slam.Config
+    config: Config
     robot: Robot
     walls: np.ndarray  # (S, 4)
     path: np.ndarray  # (N, 2)
@@ -57,8 +64,8 @@ class Case(NamedTuple):
 
 def office(seed: int) -> Case:
     """The drive from S to F."""
-    path = plan.densify(world.drive("office"))
-    return Case(seed, slam.Config(), Robot(), np.asarray(world.named("office").walls), path)
+    path = path_following.densify(worlds.waypoints("office"))
+    return Case(seed, Config(), Robot(), np.asarray(worlds.named("office").walls), path)
 
 
 def work(case: Case, runs: int, folder: Path | None, say: TextIO | None = None) -> common.Numbers:
@@ -71,9 +78,9 @@ def work(case: Case, runs: int, folder: Path | None, say: TextIO | None = None) 
         say: Stream of the progress bar.
     """
     key, robot = jax.random.key(case.seed), case.robot
-    place, path = world.World(jnp.asarray(case.walls, float)), jnp.asarray(case.path, float)
-    steps = case.steps or monte_carlo.drive_steps(robot, path)
-    noise = slam.wheel_noise(robot)
+    place, path = World(jnp.asarray(case.max_walls, float)), jnp.asarray(case.path, float)
+    steps = case.frontend.automaton_steps or drives.num_scans_of_drive(robot, path)
+    noise = NoiseParams.for_simulated_robot(*robot)
     given = key, case.config, noise, place, robot, path
     leads = jax.process_index() == 0
     folder = folder if leads else None
@@ -84,36 +91,36 @@ def work(case: Case, runs: int, folder: Path | None, say: TextIO | None = None) 
         first = int(multihost_utils.broadcast_one_to_all(np.int32(first)))
     with tqdm(total=runs, initial=min(first, runs), unit="run", file=say, desc="compiling") as bar:
         if first < runs:  # compiles, which is not timed
-            next(monte_carlo.experiment(*given, runs=first + 1, steps=steps, first=first))
+            next(trials.run_trials(*given, num_trials=first + 1, num_scans=steps, first=first))
             give_back()
         bar.set_description("running")
         bar.unpause()
         begin, new = perf_counter(), []
-        for part in monte_carlo.experiment(*given, runs=runs, steps=steps, first=first):
+        for part in trials.run_trials(*given, num_trials=runs, num_scans=steps, first=first):
             bar.update(len(part.finite))
             first += len(part.finite)
             if not leads:
                 continue
             new.append(part)
             if sum(len(one.finite) for one in new) >= KEPT or first == runs:
-                done.append(monte_carlo.collect(new))
+                done.append(episodes.concatenate_results(new))
                 now, new = perf_counter(), []
                 seconds, begin = seconds + now - begin, now
                 most = max(most, peak())
                 keep(folder, first, done[-1], mark, seconds, most)
     if not leads:
         return {"peak_mb": peak()}
-    tracks = jax.tree.map(lambda x: x[:runs], monte_carlo.collect(done))
+    tracks = jax.tree.map(lambda x: x[:runs], episodes.concatenate_results(done))
     numbers = {
         "seed": case.seed,
         "steps": steps,
         "seconds": seconds,
-        "seconds_per_scan": seconds / tracks.matches.size,
+        "seconds_per_scan": seconds / tracks.num_updates.size,
         "devices": jax.device_count(),
         "processes": jax.process_count(),
         **summary(key, tracks),
     }
-    return numbers | {"walls": case.walls, "peak_mb": max(most, peak())}
+    return numbers | {"walls": case.max_walls, "peak_mb": max(most, peak())}
 
 
 def give_back() -> None:
@@ -123,13 +130,15 @@ def give_back() -> None:
         trim(0)
 
 
-def summary(key: Any, tracks: Track) -> common.Numbers:
+def summary(key: Any, tracks: TrialResult) -> common.Numbers:
     """Distribution of the errors of B runs, and the worst of them."""
-    error = np.asarray(metrics.pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth)))
+    error = np.asarray(
+        consistency.pose_error(jnp.asarray(tracks.estimate), jnp.asarray(tracks.truth))
+    )
     off = np.linalg.norm(error[..., :2], axis=-1)  # (B, T)
-    told = monte_carlo.evaluate(tracks)
+    told = evaluate(tracks)
     keys_of = lambda runs: np.asarray(
-        jax.random.key_data(monte_carlo.run_keys(key, jnp.asarray(runs, jnp.int32)))
+        jax.random.key_data(trials.trial_keys(key, jnp.asarray(runs, jnp.int32)))
     )
     told["diverged_keys"] = keys_of(told["diverged_runs"])
     good = np.setdiff1d(np.arange(len(off)), told["nonfinite_runs"])
@@ -159,16 +168,16 @@ def summary(key: Any, tracks: Track) -> common.Numbers:
     }
 
 
-def fingerprint(case: Case, noise: slam.Noise) -> str:
+def fingerprint(case: Case, noise: NoiseParams) -> str:
     """What must be the same for runs to be of one experiment: the case and the program."""
-    text = hashlib.sha256(repr((case._replace(walls=0, path=0), programs.version())).encode())
-    for x in (case.walls, case.path, *jax.tree.leaves(noise)):
+    text = hashlib.sha256(repr((case._replace(walls=0, path=0), trace_cache.version())).encode())
+    for x in (case.max_walls, case.path, *jax.tree.leaves(noise)):
         text.update(np.asarray(x, float).tobytes())
     return f"{case.seed}, {text.hexdigest()[:16]}"
 
 
 def keep(
-    folder: Path | None, end: int, part: Track, mark: str, seconds: float, most: float
+    folder: Path | None, end: int, part: TrialResult, mark: str, seconds: float, most: float
 ) -> None:
     """Write the runs before number `end` to a file, which appears whole or not at all."""
     if folder is None:
@@ -182,7 +191,7 @@ def keep(
         np.savez(file, **part._asdict(), **told)
 
 
-def load(folder: Path | None, mark: str) -> tuple[list[Track], float, float]:
+def load(folder: Path | None, mark: str) -> tuple[list[TrialResult], float, float]:
     """Runs that were kept, from number 0 without a gap; their seconds and memory [MB]."""
     parts, seconds, most = [], 0.0, 0.0
     for first, file in _files(folder):
@@ -191,7 +200,7 @@ def load(folder: Path | None, mark: str) -> tuple[list[Track], float, float]:
         try:
             with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as kept:
                 other = str(kept["mark"])
-                part = Track(**{name: kept[name] for name in Track._fields})
+                part = TrialResult(**{name: kept[name] for name in TrialResult._fields})
                 seconds, most = float(kept["seconds"]), float(kept["peak_mb"])
         except (OSError, KeyError, ValueError, zipfile.BadZipFile):
             raise InputError("is broken", path=file, advice="remove it") from None
@@ -211,12 +220,12 @@ def _files(folder: Path | None) -> Iterator[tuple[int, Path]]:
 def replay(case: Case, run: int) -> common.Numbers:
     """Drive one run of the experiment alone; its errors."""
     path, robot = jnp.asarray(case.path, float), case.robot
-    place = world.World(jnp.asarray(case.walls, float))
-    steps = case.steps or monte_carlo.drive_steps(robot, path)
-    key, noise = jax.random.key(case.seed), slam.wheel_noise(robot)
+    place = World(jnp.asarray(case.max_walls, float))
+    steps = case.frontend.automaton_steps or drives.num_scans_of_drive(robot, path)
+    key, noise = jax.random.key(case.seed), NoiseParams.for_simulated_robot(*robot)
     given = key, case.config, noise, place, robot, path
-    alone = monte_carlo.experiment(*given, runs=run + 1, steps=steps, first=run)
-    return {"run": run} | summary(key, monte_carlo.collect(alone))
+    alone = trials.run_trials(*given, num_trials=run + 1, num_scans=steps, first=run)
+    return {"run": run} | summary(key, episodes.concatenate_results(alone))
 
 
 def together(given: Any) -> processes.Group | None:
@@ -239,7 +248,7 @@ def compute(
 ) -> common.Numbers | None:
     """Errors of B runs on all devices of a group of processes; None where process 0 is not."""
     if group is None:
-        use_cores()
+        use_cpu_devices()
         return work(case, runs, folder, sys.stderr)
     results = processes.run(group, work, case, runs, folder)
     if 0 not in group.own:
@@ -254,14 +263,14 @@ def main(argv: list[str] | None = None) -> int:
     flags = {"processes": 1, "coordinator_address": "", "num_processes": 0, "process_id": -1}
     given = common.parse(__doc__, argv, runs=10_000, replay=-1, **flags)
     folder = given.out / f"{NAME}_runs"
-    if given.runs < 1:
+    if given.frontend.segments < 1:
         raise InputError("is not positive", field="--runs")
     case = office(given.seed)
     if given.replay >= 0:
         told = replay(case, given.replay)
         print({key: told[key] for key in ("run", "position_rmse_m", "diverged", "nonfinite")})
         return 0
-    numbers = compute(case, given.runs, folder, together(given))
+    numbers = compute(case, given.frontend.segments, folder, together(given))
     if numbers is None:
         print("done; process 0 has the results")
         return 0

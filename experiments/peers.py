@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments.common import Numbers
 from experiments.one_core import least, seconds
-from jaxslam.voronoi import Diagram, expand
+from jaxslam.frontend.automaton import Diagram, expand
 
 SIZE, STEPS = 128, 64
 YARDSTICK = Path(__file__).resolve().parents[1] / ".." / "shared" / "bench" / "ca_limit.c"

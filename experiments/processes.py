@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxslam.batches import cores_here, use_cores
+from jaxslam.core.devices import num_cores, use_cpu_devices
 from jaxslam.io.errors import InputError
 
 WAIT = 45.0  # [s] in which all processes must have come up
@@ -61,7 +61,7 @@ def run(group: Group, work: Callable, *given: Any) -> list[Any]:
         InputError: The work has refused its input.
     """
     spawn = get_context("spawn")
-    cores = max(1, cores_here() // len(group.own))
+    cores = max(1, num_cores() // len(group.own))
     logs = Path(tempfile.mkdtemp(prefix="processes-"))
     children, results = {}, {}
     # Ctrl-C reaches all processes of a terminal, and is for this one.
@@ -163,7 +163,7 @@ def _child(
     for stream in (1, 2):
         os.dup2(into, stream)
     try:
-        use_cores(cores)
+        use_cpu_devices(cores)
         bind = group.address if group.address.startswith(LOOPBACK) else None
         jax.distributed.initialize(
             group.address,

@@ -20,27 +20,35 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import common, one_core
-from jaxslam import fit, lidar, logs, monte_carlo, online, report, slam
-from jaxslam.io import readers, relations, tum
+from jaxslam.cli.options import enable_caches
+from jaxslam.core import episode
+from jaxslam.core.episode import Episode
+from jaxslam.core.features import restrict_features
+from jaxslam.core.logs import LaserLog, Relations
+from jaxslam.core.se2_np import relative
+from jaxslam.core.time_series import match_times
+from jaxslam.core.types import CORNER, JUNCTION, WALL
+from jaxslam.evaluation import log_errors
+from jaxslam.evaluation.log_errors import Trajectory
+from jaxslam.filtering import slam_filter
+from jaxslam.filtering.config import confirmed, init
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import lidar
+from jaxslam.io import readers, tum
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import Recording
-from jaxslam.io.relations import Relations
-from jaxslam.metrics import match_times
-from jaxslam.monte_carlo import Log
-from jaxslam.nodes import restrict
-from jaxslam.noise import Noise, log_noise
-from jaxslam.options import keep_compiled
-from jaxslam.poses import seen_from
-from jaxslam.slam import Config
-from jaxslam.types import CORNER, NODE, WALL
+from jaxslam.io.relations import read
+from jaxslam.pipeline import episodes, offline
+from jaxslam.pipeline.config import MAX_LANDMARKS, Config
+from jaxslam.pipeline.offline import SlamResult
+from jaxslam.tuning import fitting
 
 NAME = "real_logs"
 SUFFIXES = (".clf", ".log", ".gz", ".g2o", ".zip", ".bag", ".npz")
 LANDMARKS = {
     "none": (),
-    "nodes": (NODE,),
-    "nodes+corners": (NODE, CORNER),
-    "all": (NODE, CORNER, WALL),
+    "nodes": (JUNCTION,),
+    "nodes+corners": (JUNCTION, CORNER),
+    "all": (JUNCTION, CORNER, WALL),
 }
 ODOMETRY = ("wheels", "scan")
 STEPS = 12  # of tuning
@@ -50,8 +58,8 @@ class Known(NamedTuple):
     """A log, and what is known of the way of its robot."""
 
     name: str
-    recording: Recording
-    reference: report.Trajectory | None
+    recording: LaserLog
+    reference: Trajectory | None
     relations: Relations | None
 
 
@@ -59,7 +67,7 @@ class Seen(NamedTuple):
     """What the filter is given of a log."""
 
     config: Config
-    log: Log  # with its motions aligned; the truth is the reference since the first scan
+    log: Episode  # with its motions aligned; the truth is the reference since the first scan
     ms: dict[str, float]  # a scan, one core, from ranges to the smoothed map, by odometry
 
 
@@ -71,7 +79,7 @@ def find(folder: Path | None) -> list[Known]:
         for path in files
         if path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
     }
-    for name in readers.KNOWN:
+    for name in readers.NAMED_LOGS:
         try:
             paths[name] = readers.find(name)
         except InputError as error:
@@ -88,7 +96,7 @@ def find(folder: Path | None) -> list[Known]:
             name,
             readers.read(path),
             None if reference is None else tum.read(reference),
-            None if pairs is None else relations.read(pairs),
+            None if pairs is None else read(pairs),
         )
         found.append(one)
     return found
@@ -97,80 +105,96 @@ def find(folder: Path | None) -> list[Known]:
 def look(known: Known) -> Seen:
     """Features and aligned motions of a log, and what mapping it costs on one core."""
     recording = known.recording
-    config = logs.config_of_scans([recording])._replace(landmarks=online.MOST)
-    motion = logs.motions(recording.odometry)
-    scans = lidar.limit(jnp.asarray(recording.ranges, float), config.lidar)
+    config = episodes.laser_log_config([recording])._replace(
+        filter=episodes.laser_log_config([recording]).filter._replace(
+            max_landmarks=MAX_LANDMARKS,
+        ),
+    )
+    motion = episodes.odometry_increments(recording.odom_poses)
+    scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(recording.ranges, float))
     truth, judged = np.zeros(motion.shape, np.float32), np.zeros(len(motion), bool)
     if known.reference is not None:
         i, j = match_times(recording.times, known.reference[0]).T
-        truth[i] = seen_from(known.reference[1][j[0]], known.reference[1][j])
+        truth[i] = relative(known.reference[1][j[0]], known.reference[1][j])
         judged[i] = True
-    surveys: dict[str, online.Survey] = {}
+    surveys: dict[str, SlamResult] = {}
 
     def survey(odometry: str) -> None:
         by_scans = odometry == "scan"
-        given = config, log_noise(aligned=by_scans), jnp.zeros(3), motion, scans
-        surveys[odometry] = online.survey(*given, aligned=by_scans, smooth=True)
+        given = config, NoiseParams.for_laser_log(match_scans=by_scans), jnp.zeros(3), motion, scans
+        surveys[odometry] = offline.run_slam(*given, match_scans=by_scans, smooth=True)
 
     one_core.pin()
     taken = one_core.least({name: (survey, name) for name in ODOMETRY}, repeats=1)
     one_core.unpin()
     found = surveys["scan"]
-    config = config._replace(landmarks=found.belief.seen.size)  # as many as it grew to
-    log = Log(truth, motion, found.nodes, None, judged, aligned=found.aligned)
-    return Seen(config, logs.real(log), {name: 1e3 * s / len(motion) for name, s in taken.items()})
+    config = config._replace(
+        filter=config.filter._replace(
+            max_landmarks=found.belief.num_seen.size,
+        ),
+    )  # as many as it grew to
+    log = Episode(truth, motion, found.nodes, None, judged, scan_matches=found.aligned)
+    return Seen(
+        config,
+        episodes.to_numpy_precision(log),
+        {name: 1e3 * s / len(motion) for name, s in taken.items()},
+    )
 
 
-def given(log: Log, odometry: str, landmarks: str) -> Log:
+def given(log: Episode, odometry: str, landmarks: str) -> Episode:
     """The log with some kinds of landmarks, and with its motions aligned or not."""
     kinds = jnp.array(LANDMARKS[landmarks] or (-1,), jnp.int32)
-    some = jax.vmap(restrict)(log.nodes, jnp.isin(log.nodes.kind, kinds))
-    aligned = log.aligned if odometry == "scan" else None
-    return log._replace(nodes=jax.tree.map(np.asarray, some), aligned=aligned)
+    some = jax.vmap(restrict_features)(log.features, jnp.isin(log.features.kind, kinds))
+    aligned = log.scan_matches if odometry == "scan" else None
+    return log._replace(features=jax.tree.map(np.asarray, some), scan_matches=aligned)
 
 
 def tuned(others: Sequence[Seen], odometry: str) -> dict[str, Any] | None:
     """Noise tuned on the logs that have a reference; None if there are none."""
-    some = [one for one in others if one.log.judged.any()]
+    some = [one for one in others if one.log.truth_mask.any()]
     if not some:
         return None
-    together = logs.stack([given(one.log, odometry, "all") for one in some])
+    together = episodes.stack_episodes([given(one.log, odometry, "all") for one in some])
     with tqdm(total=STEPS + 1, unit="step", leave=False, desc=f"tuning, {odometry}") as bar:
-        start = log_noise(aligned=odometry == "scan")
+        start = NoiseParams.for_laser_log(match_scans=odometry == "scan")
         report = lambda _: bar.update()
         # The filter asks of the scanner no more than its field of view.
-        found = fit.tune(start, some[0].config, together, steps=STEPS, report=report)
-    return found.noise._asdict()
+        found = fitting.tune(some[0].config, start, together, num_updates=STEPS, callback=report)
+    return found.params._asdict()
 
 
 def row(
-    known: Known, seen: Seen, odometry: str, landmarks: str, noise: Noise
+    known: Known, seen: Seen, odometry: str, landmarks: str, noise: NoiseParams
 ) -> tuple[common.Numbers, np.ndarray]:
     """Errors of one way to do it, and the estimated positions (T, 2)."""
     log = given(seen.log, odometry, landmarks)
-    start = slam.init(seen.config, jnp.zeros(3))
-    inputs = monte_carlo.inputs_of(log)
-    belief, info = slam.run(seen.config, noise, start, inputs)
+    start = init(seen.config.filter, jnp.zeros(3))
+    inputs = episode.measurements_of(log)
+    belief, info = slam_filter.run_filter(seen.config.filter, noise, start, inputs)
     inputs, info = jax.tree.map(np.asarray, (inputs, info))
     filtered = np.asarray(info.pose, np.float64)
     scans = None
     if odometry == "scan" and LANDMARKS[landmarks]:  # scans alone are odometry, no loop is closed
-        scans = lidar.limit(jnp.asarray(known.recording.ranges, float), seen.config.lidar)
-    poses, _, _ = online.smoothed(
+        scans = lidar.to_scan(
+            seen.config.frontend.lidar, jnp.asarray(known.recording.ranges, float)
+        )
+    poses, _, _ = offline.smooth_result(
         seen.config, noise, jnp.zeros(3), inputs, info, belief, jax.tree.map(np.asarray, scans)
     )
     numbers: common.Numbers = {"nees": None}
-    numbers["landmarks_confirmed"] = int(np.sum(slam.confirmed(seen.config, belief)))
+    numbers["landmarks_confirmed"] = int(np.sum(confirmed(seen.config.filter, belief)))
     numbers["ms_per_scan"] = seen.ms[odometry]
     for prefix, way in (("", poses), ("filter_", filtered)):
-        told = report.judged(known.recording, way, known.reference, known.relations)
+        told = log_errors.errors_against(known.recording, way, known.reference, known.relations)
         pairs = told.get("relations", {})
         numbers[f"{prefix}ate_rmse_m"] = told.get("ate_rmse_m")
         numbers[f"{prefix}relations_translation_m"] = pairs.get("translation_mean_m")
         numbers[f"{prefix}relations_rotation_deg"] = pairs.get("rotation_mean_deg")
     if known.reference is not None:
-        error = np.where(log.judged[:, None], report.error_of(filtered, log.truth), np.nan)
-        numbers["nees"] = report.nees_of(error, info.pose_cov)
+        error = np.where(
+            log.truth_mask[:, None], log_errors.pose_errors(filtered, log.truth), np.nan
+        )
+        numbers["nees"] = log_errors.mean_nees_per_dof(error, info.pose_cov)
     return numbers, poses[:, :2]
 
 
@@ -186,18 +210,18 @@ def compute(folder: Path | None, tune: bool, kept: common.Kept) -> common.Number
     seen = [look(one) for one in tqdm(known, unit="log", desc="looking")]
     rows, ways = [], {}
     for k, (one, own) in enumerate(zip(known, seen, strict=True)):
-        wheels = seen_from(one.recording.odometry[0], one.recording.odometry)
+        wheels = relative(one.recording.odom_poses[0], one.recording.odom_poses)
         ways[one.name] = {"wheels": wheels[:, :2]}
-        if own.log.judged.any():
-            ways[one.name]["reference"] = own.log.truth[own.log.judged, :2]
+        if own.log.truth_mask.any():
+            ways[one.name]["reference"] = own.log.truth[own.log.truth_mask, :2]
         for odometry in ODOMETRY:
-            noises = {"default": log_noise(aligned=odometry == "scan")}
+            noises = {"default": NoiseParams.for_laser_log(match_scans=odometry == "scan")}
             others = [*seen[:k], *seen[k + 1 :]]
             make = lambda others=others, odometry=odometry: {"noise": tuned(others, odometry)}
             found = kept(f"{one.name} {odometry}", make)["noise"] if tune else None
             if found is not None:
                 values = {name: x and jnp.asarray(x, float) for name, x in found.items()}
-                noises["tuned"] = Noise(**values)
+                noises["tuned"] = NoiseParams(**values)
             for landmarks in LANDMARKS:
                 for name, noise in noises.items():
                     numbers, way = row(one, own, odometry, landmarks, noise)
@@ -266,7 +290,7 @@ def _draw_rows(axis: Any, rows: list[common.Numbers]) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
     options = common.parse(__doc__, argv, data="", tune=1)
-    keep_compiled()
+    enable_caches()
     kept = common.Kept(options.out / f"{NAME}_parts", {"data": options.data})
     folder = Path(options.data) if options.data else None
     if folder is not None and not folder.is_dir():

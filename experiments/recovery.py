@@ -11,9 +11,11 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments import common, exact
-from jaxslam import curvature, fit, monte_carlo
-from jaxslam.monte_carlo import Log
-from jaxslam.slam import Noise
+from jaxslam.core.episode import Episode
+from jaxslam.evaluation import summary
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline import episodes
+from jaxslam.tuning import fitting, parameters, standard_errors
 
 FACTOR = 5.0
 PACK, SOME = 32, 64  # runs of a step at first, then
@@ -35,10 +37,12 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
             rows.append(kept(f"start {number}", lambda n=number: _recover(seed, n, train, test)))
             bar.update()
     best = min(rows, key=lambda row: row["loss"])
-    sure = kept("standard errors", lambda: _errors(fit.noise_of(best["theta"], truth), train))
+    sure = kept(
+        "standard errors", lambda: _errors(parameters.unflatten_params(best["theta"], truth), train)
+    )
     se = np.array([np.nan if x is None else x for x in sure["relative"]])
     known = np.array(sure["identifiable"])
-    off = np.array([row["theta"] for row in rows]) - fit.theta_of(truth)
+    off = np.array([row["theta"] for row in rows]) - parameters.flatten_params(truth)
     z = off[:, known] / se[known]
     ratio = np.array([row["heldout_rmse_m"] for row in rows]) / right
     return {
@@ -53,43 +57,45 @@ def compute(seed: int, starts: int, runs: int, heldout: int, kept: common.Kept) 
         "identifiable": sure["identifiable"],
         "standard_errors": sure["relative"],
         "warnings": sure["warnings"],
-        "log_truth": fit.theta_of(truth),
+        "log_truth": parameters.flatten_params(truth),
         "rows": rows,
     }
 
 
-def _recover(seed: int, number: int, train: Log, test: Log) -> common.Numbers:
+def _recover(seed: int, number: int, train: Episode, test: Episode) -> common.Numbers:
     """Tune from a start drawn at random."""
-    truth = fit.theta_of(exact.truth())
+    truth = parameters.flatten_params(exact.truth())
     reach = np.log(FACTOR)
     start = truth + np.random.default_rng([seed, number]).uniform(-reach, reach, truth.size)
-    rough = fit.tune(
-        fit.noise_of(start, exact.truth()),
+    rough = fitting.tune(
         exact.CONFIG,
+        parameters.unflatten_params(start, exact.truth()),
         train,
-        steps=ROUGH,
-        batch=PACK,
+        num_updates=ROUGH,
+        batch_size=PACK,
         seed=number,
     )
-    near = fit.tune(rough.noise, exact.CONFIG, common.part(train, slice(SOME)), steps=MIDDLE)
-    fine = fit.tune(near.noise, exact.CONFIG, train, steps=FINE)
+    near = fitting.tune(
+        exact.CONFIG, rough.params, common.part(train, slice(SOME)), num_updates=MIDDLE
+    )
+    fine = fitting.tune(exact.CONFIG, near.params, train, num_updates=FINE)
     return {
         "start": start,
-        "theta": fit.theta_of(fine.noise),
+        "theta": parameters.flatten_params(fine.params),
         "loss": fine.loss[fine.best],
         "skipped": int(sum(one.skipped.sum() for one in (rough, near, fine))),
-        "heldout_rmse_m": position_rmse(fine.noise, test),
+        "heldout_rmse_m": position_rmse(fine.params, test),
     }
 
 
-def _errors(noise: Noise, train: Log) -> common.Numbers:
-    sure = curvature.standard_errors(noise, exact.CONFIG, train)
+def _errors(noise: NoiseParams, train: Episode) -> common.Numbers:
+    sure = standard_errors.standard_errors(exact.CONFIG, noise, train)
     return {**sure._asdict()}
 
 
-def position_rmse(noise: Noise, logs: Log) -> float:
+def position_rmse(noise: NoiseParams, logs: Episode) -> float:
     """Position RMSE [m] of the filter on drives [B]."""
-    return monte_carlo.evaluate(monte_carlo.tracks(exact.CONFIG, noise, logs))["position_rmse_m"]
+    return summary.evaluate(episodes.filter_episodes(exact.CONFIG, noise, logs))["position_rmse_m"]
 
 
 def draw(axis: Any, told: common.Numbers) -> None:

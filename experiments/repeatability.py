@@ -32,13 +32,17 @@ from experiments.viewpoints import (
     turned,
     visible_circles,
 )
-from jaxslam import lidar, slam, world
-from jaxslam.batches import map_batches
-from jaxslam.io import occupancy
+from jaxslam.core.batching import map_batches
+from jaxslam.core.features import Features
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.types import JUNCTION
+from jaxslam.frontend import extract, lidar
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.io import ros_map
 from jaxslam.io.errors import InputError
-from jaxslam.lidar import Scan
-from jaxslam.nodes import Nodes
-from jaxslam.types import NODE
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import floor_plans, ray_casting
+from jaxslam.simulation.worlds import named
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 WILLOW = SHARED / "maps" / "willow-full.yaml"  # no part of the project
@@ -50,7 +54,7 @@ DISTANCES = (0.0, 0.5, 1.0, APART)  # [m] edges of bins
 HEADINGS = (0.0, 60.0, 120.0, 180.0)  # [degrees] likewise
 
 Worlds = dict[str, list[Scene]]
-Seen = dict[str, list[tuple[Scene, Nodes]]]
+Seen = dict[str, list[tuple[Scene, Features]]]
 
 
 class Case(NamedTuple):
@@ -61,36 +65,48 @@ class Case(NamedTuple):
     skip: int = 1  # every beam of the lidar, or every second
 
     @property
-    def config(self) -> slam.Config:
+    def config(self) -> Config:
         """What the front end is given."""
-        usual = lidar.Lidar()
-        beams, step = (usual.beams - 1) // self.skip + 1, usual.step * self.skip
-        own = usual._replace(noise=self.noise, beams=beams, step=step)
-        labels = slam.Config().labels if self.labels == "thinning" else self.labels
-        return slam.Config(lidar=own, labels=labels)
+        usual = Lidar()
+        beams, step = (usual.num_beams - 1) // self.skip + 1, usual.angle_increment * self.skip
+        own = usual._replace(range_std=self.noise, num_beams=beams, angle_increment=step)
+        labels = Config().frontend.labels if self.labels == "thinning" else self.labels
+        return Config.for_lidar(
+            own,
+            frontend=FrontendConfig(
+                labels=labels,
+            ),
+        )
 
 
 USUAL, COARSE = Case("runs", 0.01), Case("runs", 0.01, skip=2)
 
 
 @partial(jax.jit, static_argnames="config")
-def _features(config: slam.Config, scans: Scan) -> Nodes:
-    return map_batches(partial(slam.front_end, config), scans, size=slam.BATCH)
+def _features(config: Config, scans: Scan) -> Features:
+    return map_batches(
+        partial(extract.extract_features, config.frontend), scans, batch_size=extract.SCAN_BATCH
+    )
 
 
 def look(key, worlds: Worlds, case: Case) -> Seen:
     """Landmarks of a noisy scan from each viewpoint; the same key means the same noise."""
-    scenes, scanner = [at for scenes in worlds.values() for at in scenes], case.config.lidar
+    scenes, scanner = (
+        [at for scenes in worlds.values() for at in scenes],
+        case.config.frontend.lidar,
+    )
     ranges = jnp.asarray(np.concatenate([at.ranges[:, :: case.skip] for at in scenes]), float)
-    scans = lidar.disturb(key, lidar.limit(ranges, scanner), scanner)
+    scans = ray_casting.add_range_noise(key, scanner, lidar.to_scan(scanner, ranges))
     find = thinning.landmarks if case.labels == "thinning" else _features
     found = jax.tree.map(np.asarray, find(case.config, scans))
     ends = np.cumsum([len(at.poses) for at in scenes])[:-1]
     parts = zip(*(np.split(field, ends) for field in found), strict=True)
-    return {name: [(at, Nodes(*next(parts))) for at in scenes] for name, scenes in worlds.items()}
+    return {
+        name: [(at, Features(*next(parts))) for at in scenes] for name, scenes in worlds.items()
+    }
 
 
-def judge(config: slam.Config, at: Scene, found: Nodes, kinds: dict[str, int]) -> dict:
+def judge(config: Config, at: Scene, found: Features, kinds: dict[str, int]) -> dict:
     """Checks of one scene, by kind of landmark: lists and counts to be pooled over scenes."""
     place, poses, half = at.place, at.poses, len(at.poses) // 2
     xy, cov = to_world(poses, found.xy), turned(poses, found.cov)
@@ -98,7 +114,7 @@ def judge(config: slam.Config, at: Scene, found: Nodes, kinds: dict[str, int]) -
     inverse = np.linalg.pinv(np.where(known[..., None, None], cov, 0.0))
     out = {}
     for name, kind in kinds.items():
-        true = place.junctions if kind == NODE else place.corners.xy
+        true = place.junctions if kind == JUNCTION else place.max_corners.xy
         valid = found.valid & (found.kind == kind)
         trusted = valid & found.trusted
         off, nearest = cKDTree(true).query(xy)
@@ -108,13 +124,15 @@ def judge(config: slam.Config, at: Scene, found: Nodes, kinds: dict[str, int]) -
         one = slice(0, half), slice(half, None)
         for a, b in (one, one[::-1]):
             ought = trusted[a].copy()
-            if kind == NODE:
+            if kind == JUNCTION:
                 n, m = np.nonzero(ought)
-                circles = xy[a][n, m], found.shape[a][n, m]
+                circles = xy[a][n, m], found.descriptor[a][n, m]
                 both = [visible_circles(place, poses[v][n], *circles, config) for v in (a, b)]
                 ought[n, m] = both[0] & both[1]
             else:
-                ought &= np.take_along_axis(at.corners[a] & at.corners[b], nearest[a], axis=1)
+                ought &= np.take_along_axis(
+                    at.max_corners[a] & at.max_corners[b], nearest[a], axis=1
+                )
                 ought &= off[a] < SPURIOUS
             away = np.hypot(*np.moveaxis(xy[a][:, :, None] - xy[b][:, None], -1, 0))
             away = np.where(valid[b][:, None], away, np.inf).min(axis=-1)
@@ -159,11 +177,11 @@ def rows(seen: Seen, case: Case, pick: Callable = everyone, **more) -> list[comm
     result = []
     for name, scenes in seen.items():
         place = scenes[0][0].place
-        kinds = {"node": NODE} if case.labels == "thinning" else place.kinds
+        kinds = {"node": JUNCTION} if case.labels == "thinning" else place.filter.landmark_kinds
         parts = []
         for at, nodes in scenes:
             use = pick(at)
-            some = Nodes(*(field[np.tile(use, 2)] for field in nodes))
+            some = Features(*(field[np.tile(use, 2)] for field in nodes))
             parts.append(judge(case.config, at.take(use), some, kinds))
         for kind in kinds:
             head = {"world": name, "labels": case.labels, "noise_m": case.noise, "kind": kind}
@@ -198,11 +216,11 @@ def worlds_of(seed: int, plans: int, pairs: int) -> tuple[Worlds, dict[str, str]
     at = lambda place, count: scene(place, rng, count, APART, USUAL.config)
     keys = tqdm(jax.random.split(jax.random.key(seed), plans), unit="plan", leave=False)
     worlds = {
-        "office": [at(Drawn(world.named("office").walls), 3 * pairs)],
-        "floor plans": [at(Drawn(world.floor_plan(key).walls), pairs) for key in keys],
+        "office": [at(Drawn(named("office").walls), 3 * pairs)],
+        "floor plans": [at(Drawn(floor_plans.floor_plan(key).walls), pairs) for key in keys],
     }
     try:
-        own = occupancy.read(WILLOW)
+        own = ros_map.read(WILLOW)
     except InputError as error:
         return worlds, {"willow": str(error)}
     return worlds | {"willow": [at(Cells(own.occupied, own.free, own.resolution), 6 * pairs)]}, {}
@@ -224,7 +242,7 @@ def compute(seed: int, plans: int, pairs: int) -> common.Numbers:
             own = rows(seen, case)
             numbers["rows"] += own if case.skip == 1 else []
             if case in (USUAL, COARSE):
-                step = round(np.degrees(case.config.lidar.step), 3)
+                step = round(np.degrees(case.config.frontend.lidar.angle_increment), 3)
                 numbers["by_step"] += [r | {"beam_step_deg": step} for r in own]
             if case == USUAL:
                 numbers["by_distance"] = binned(seen, apart, DISTANCES)

@@ -12,7 +12,7 @@ from scipy.optimize import root
 from scipy.spatial import Voronoi
 
 from experiments.common import Numbers
-from jaxslam.nodes import NodeSpec
+from jaxslam.frontend.features import FeatureSpec
 
 NEAR = 0.1  # [m] places this close are one junction
 SPACING = 0.02  # [m] between the points that stand for a wall
@@ -87,11 +87,15 @@ def refine(place: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, float, flo
 def reference(walls: np.ndarray) -> Numbers:
     """Junctions of the room that can be nodes of a map, and the branches that join them."""
     place, joined = branch_graph(walls)
-    spec, junctions = NodeSpec(), []
+    spec, junctions = FeatureSpec(), []
     for vertex in (v for v, others in joined.items() if len(others) >= 3):
         centre, clearance, spread = refine(place[vertex], walls)
         known = any(np.hypot(*(centre - j["xy"])) < NEAR for j in junctions)
-        if not known and spec.least < clearance < spec.most and spread > spec.apart:
+        if (
+            not known
+            and spec.min_clearance < clearance < spec.max_clearance
+            and spread > spec.min_foot_angle
+        ):
             junctions.append({"xy": centre, "clearance_m": clearance, "spread_rad": spread})
     junctions.sort(key=lambda j: tuple(j["xy"].round(3)))
     xy = np.array([j["xy"] for j in junctions])

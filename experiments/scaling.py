@@ -14,7 +14,10 @@ import jax
 from experiments import common, one_core
 from experiments.common import Numbers
 from experiments.estimator import apart, peak
-from jaxslam import monte_carlo, slam
+from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import trials
 
 LONG = 346  # scans of a run where devices are compared, as starting and ending take their time
 RUNS, STEPS, LANDMARKS = 32, 50, 96  # where they do not vary
@@ -26,11 +29,22 @@ def chain(seed: int, runs: int, steps: int, landmarks: int, pinned: bool) -> Num
     """Seconds of B runs of ray casting, front end and filter, and the peak memory of all of it."""
     one_core.pin() if pinned else one_core.unpin()
     place, robot, path, _ = common.scene()
-    config = slam.Config(landmarks=landmarks)
-    given = jax.random.key(seed), config, slam.wheel_noise(robot), place, robot, path
+    config = Config(
+        filter=FilterConfig(
+            max_landmarks=landmarks,
+        ),
+    )
+    given = (
+        jax.random.key(seed),
+        config,
+        NoiseParams.for_simulated_robot(*robot),
+        place,
+        robot,
+        path,
+    )
 
     def some(runs: int) -> None:
-        for _ in monte_carlo.experiment(*given, runs=runs, steps=steps):
+        for _ in trials.run_trials(*given, num_trials=runs, num_scans=steps):
             pass  # nothing is kept
 
     begin = perf_counter()

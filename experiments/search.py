@@ -13,10 +13,14 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.common import Numbers
-from jaxslam import fit, monte_carlo
-from jaxslam.losses import Loss, calibrated
-from jaxslam.monte_carlo import Log
-from jaxslam.slam import Config, Noise
+from jaxslam.core.episode import Episode
+from jaxslam.evaluation import summary
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.tuning import fitting, parameters
+from jaxslam.tuning.fitting import TuneState
+from jaxslam.tuning.losses import Loss, pose_nll
 
 WIDE = 30.0  # each parameter is searched within this factor of the one set by hand
 
@@ -25,9 +29,9 @@ class Task(NamedTuple):
     """What the noise is wanted for."""
 
     config: Config
-    hand: Noise  # set by hand; where everything starts
-    train: Log  # [B]
-    test: Log  # [H]
+    hand: NoiseParams  # set by hand; where everything starts
+    train: Episode  # [B]
+    test: Episode  # [H]
     frozen: tuple[str, ...] = ()
 
 
@@ -46,14 +50,14 @@ class Trace:
         """Seconds so far, without those of judging."""
         return perf_counter() - self._since - self._stopped
 
-    def add(self, noise: Noise, loss: float) -> None:
+    def add(self, noise: NoiseParams, loss: float) -> None:
         """Note an evaluation of the training runs."""
         self.evaluations += 1
         if not loss < self._least:
             return
         self._least, now, begin = loss, self.seconds, perf_counter()
         told = {"evaluations": self.evaluations, "seconds": now, "loss": loss}
-        told["theta"] = fit.theta_of(noise)
+        told["theta"] = parameters.flatten_params(noise)
         self.points.append(told | judge(self._task, noise))
         self._stopped += perf_counter() - begin
 
@@ -63,9 +67,9 @@ class Trace:
         return {"points": self.points, "evaluations": self.evaluations, "seconds": seconds}
 
 
-def judge(task: Task, noise: Noise) -> Numbers:
+def judge(task: Task, noise: NoiseParams) -> Numbers:
     """Errors on the held-out runs."""
-    told = monte_carlo.evaluate(monte_carlo.tracks(task.config, noise, task.test))
+    told = summary.evaluate(episodes.filter_episodes(task.config, noise, task.test))
     keys = {"position_rmse_m": "heldout_rmse_m", "nees": "nees", "diverged": "diverged"}
     return {new: told[key] for key, new in keys.items()}
 
@@ -73,23 +77,25 @@ def judge(task: Task, noise: Noise) -> Numbers:
 def compile_all(task: Task, loss: Loss) -> None:
     """Compile what a search runs."""
     judge(task, task.hand)
-    fit.values(task.hand, task.config, task.train, loss)
-    fit.tune(task.hand, task.config, task.train, loss=loss, steps=1)
+    fitting.values(task.config, task.hand, task.train, loss)
+    fitting.tune(task.config, task.hand, task.train, loss=loss, num_updates=1)
 
 
 def by_gradient(task: Task, loss: Loss, steps: int) -> Numbers:
-    """`fit.tune`."""
+    """`fitting.tune`."""
     trace = Trace(task)
     with tqdm(total=steps + 1, unit="step", leave=False, desc=loss.__name__) as bar:
 
-        def report(state: fit.State) -> None:
+        def report(state: TuneState) -> None:
             at = int(state.step) - 1
             bar.set_postfix(loss=f"{state.loss[at]:.4g}")
             bar.update()
-            trace.add(fit.noise_of(state.thetas[at], task.hand), state.loss[at])
+            trace.add(
+                parameters.unflatten_params(state.theta_history[at], task.hand), state.loss[at]
+            )
 
         how = {"loss": loss, "steps": steps, "frozen": task.frozen, "report": report}
-        fit.tune(task.hand, task.config, task.train, **how)
+        fitting.tune(task.config, task.hand, task.train, **how)
     return trace.numbers()
 
 
@@ -139,16 +145,16 @@ def methods() -> list[str]:
 
 def by_search(task: Task, method: str, seed: int, seconds: float, least: int) -> Numbers:
     """Search for at least so many seconds and evaluations."""
-    moves = fit.free(task.hand, task.frozen)
+    moves = parameters.trainable_mask(task.hand, task.frozen)
     ask, tell = METHODS[method](int(moves.sum()), seed)
-    hand = fit.theta_of(task.hand)
+    hand = parameters.flatten_params(task.hand)
     trace = Trace(task)
     with tqdm(total=round(seconds), unit="s", leave=False, desc=method) as bar:
         while trace.seconds < seconds or trace.evaluations < least:
             theta = hand.copy()
             theta[moves] += np.log(WIDE) * ask()
-            noise = fit.noise_of(theta, task.hand)
-            values = fit.values(noise, task.config, task.train, calibrated)
+            noise = parameters.unflatten_params(theta, task.hand)
+            values = fitting.values(task.config, noise, task.train, pose_nll)
             # A noise with which a run gives no number is no candidate.
             loss = float(values.mean()) if np.isfinite(values).all() else np.inf
             tell(loss)

@@ -12,37 +12,38 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import common, estimator, workload
-from jaxslam import smoother
-from jaxslam.batches import map_batches
-from jaxslam.metrics import pose_error
-from jaxslam.types import CORNER, Array
+from jaxslam.core.batching import map_batches
+from jaxslam.core.types import CORNER, Array
+from jaxslam.evaluation.consistency import pose_error
+from jaxslam.smoothing import dense
+from jaxslam.smoothing.problem import LandmarkPrior, SmoothingProblem, SmoothingResult
 
 ITERATIONS = 10
 
 
-def smooth_one(run: workload.Drive, poses: Array) -> smoother.Track:
+def smooth_one(run: workload.Drive, poses: Array) -> SmoothingResult:
     """Smooth one run from the filter's poses (T, 3) and the places that were known beforehand."""
     steps, size = run.motion.shape[0], run.prior.shape[0]
     variance = run.prior_cov[:, 0, 0]
     information = jnp.eye(2, dtype=variance.dtype)[None] / variance[:, None, None]
-    records = smoother.Records(
+    records = SmoothingProblem(
         start=jnp.zeros(3, run.motion.dtype),
-        motion=run.motion,
-        q=jnp.broadcast_to(run.q, (steps, 3, 3)),
-        seen=run.polar,
-        r=run.r,
+        odometry=run.motion,
+        odometry_cov=jnp.broadcast_to(run.q, (steps, 3, 3)),
+        measurement=run.polar,
+        measurement_cov=run.r,
         kind=jnp.full(run.who.shape, CORNER, jnp.int32),
-        which=jnp.where(run.who < 0, size, run.who),
-        prior=smoother.Prior(run.prior, information),
+        landmark_index=jnp.where(run.who < 0, size, run.who),
+        prior=LandmarkPrior(run.prior, information),
     )
-    return smoother.smooth(records, poses, run.prior, iterations=ITERATIONS)
+    return dense.smooth_trial(records, poses, run.prior, iterations=ITERATIONS)
 
 
 @jax.jit
 def smoothed(drive: workload.Drive, poses: Array) -> Array:
     """Smooth B runs from the filter's poses (B, T, 3), a few together; poses (B, T, 3)."""
     one = lambda given: smooth_one(*given).poses
-    return map_batches(one, (drive, poses), size=workload.TOGETHER)
+    return map_batches(one, (drive, poses), batch_size=workload.TOGETHER)
 
 
 def errors(poses: Array, truth: np.ndarray) -> common.Numbers:
@@ -63,7 +64,7 @@ def compute(seed: int, runs: int) -> common.Numbers:
     """Errors of both on the rings, whose landmarks are known beforehand to half a metre."""
     drive = workload.rings(seed, runs)
     given = workload.as_floats(drive)
-    poses = {"filter": estimator.filtered(given).pose}
+    poses = {"filter": estimator.filtered(given).last_pose}
     poses["smoother"] = smoothed(given, poses["filter"])
     told = {name: errors(x, drive.truth) for name, x in poses.items()}
     better = np.mean(told["smoother"].pop("by_run_m") < told["filter"].pop("by_run_m"))
@@ -86,7 +87,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
     given = common.parse(__doc__, argv, runs=512)
-    numbers = compute(given.seed, given.runs)
+    numbers = compute(given.seed, given.frontend.segments)
     common.save(given.out, "smoothing", numbers, draw)
     for name in ("filter", "smoother"):
         of = numbers[name]

@@ -16,9 +16,11 @@ import numpy as np
 
 from experiments import common
 from experiments.common import Numbers
-from jaxslam import monte_carlo, slam
+from jaxslam.core import se2
+from jaxslam.core.logs import LaserLog
 from jaxslam.io import npz
-from jaxslam.io.recording import Recording
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import drives
 
 USUAL = "from jaxslam.cli import main; raise SystemExit(main())"
 ANEW = f"from jaxslam import programs; programs.keep = lambda: None; {USUAL}"
@@ -28,12 +30,12 @@ MAPPED = b"mapping"  # of the bar, from the first stretch of scans on
 def simulated(seed: int, path: Path) -> None:
     """A log of the office drive."""
     place, robot, way, steps = common.scene()
-    given = jax.random.key(seed), slam.Config(), place, robot, way
-    truth, told, scans = monte_carlo.simulate_scans(*given, steps=steps)
+    given = jax.random.key(seed), Config(), place, robot, way
+    truth, told, scans = drives.simulate_scans(*given, num_scans=steps)
     ranges = np.where(scans.hit, scans.ranges, np.inf).astype(np.float32)
     times = np.arange(steps, dtype=float)
-    poses = np.asarray(monte_carlo.dead_reckoning(truth[0], told), float)
-    npz.write(path, Recording(times, poses, ranges, slam.Config().lidar, 0, times, poses))
+    poses = np.asarray(se2.dead_reckoning(truth[0], told), float)
+    npz.write(path, LaserLog(times, poses, ranges, Config().frontend.lidar, 0, times, poses))
 
 
 def start(log: Path, folder: Path, code: str) -> Numbers:

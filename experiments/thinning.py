@@ -7,11 +7,14 @@ import jax
 import numpy as np
 from scipy import ndimage
 
-from jaxslam import grid, slam
-from jaxslam.batches import map_batches
-from jaxslam.lidar import Scan, points
-from jaxslam.nodes import Nodes
-from jaxslam.types import NODE
+from jaxslam.core.batching import map_batches
+from jaxslam.core.features import Features
+from jaxslam.core.scan import Scan
+from jaxslam.core.types import JUNCTION
+from jaxslam.frontend import extract, grid
+from jaxslam.frontend.grid import GridSpec
+from jaxslam.frontend.lidar import beam_ends
+from jaxslam.pipeline.config import Config
 
 NEEDS = ("skimage.morphology", "sknw")
 GAP = 0.3  # [m] between neighbouring hits that are one wall
@@ -30,22 +33,22 @@ def missing() -> list[str]:
 
 
 @partial(jax.jit, static_argnames="config")
-def _seen(config: slam.Config, scans: Scan):
+def _seen(config: Config, scans: Scan):
     """Ends (N, R, 2) [m] of scans [N], and the cells (N, H, W) that they show to be free."""
     one = lambda scan: (
-        points(scan, config.lidar),
-        grid.seen_free(scan, config.lidar, config.grid),
+        beam_ends(config.frontend.lidar, scan),
+        grid.seen_free(config.frontend.lidar, config.frontend.grid, scan),
     )
-    return map_batches(one, scans, size=slam.BATCH)
+    return map_batches(one, scans, batch_size=extract.SCAN_BATCH)
 
 
-def walls(ends: np.ndarray, hit: np.ndarray, spec: grid.GridSpec) -> np.ndarray:
+def walls(ends: np.ndarray, hit: np.ndarray, spec: GridSpec) -> np.ndarray:
     """Cells (H, W) bool of the hits (R,) among ends (R, 2) [m], neighbours joined."""
     both = hit[:-1] & hit[1:] & (np.hypot(*np.diff(ends, axis=0).T) < GAP)
-    part = np.linspace(0, 1, int(np.ceil(2 * GAP / spec.cell)) + 1)[:, None, None]
+    part = np.linspace(0, 1, int(np.ceil(2 * GAP / spec.cell_size)) + 1)[:, None, None]
     joined = ends[:-1][both] + part * np.diff(ends, axis=0)[both]
     at = np.concatenate([joined.reshape(-1, 2), ends[hit]])
-    index = np.floor((at - grid.corner(spec)) / spec.cell).astype(int)
+    index = np.floor((at - grid.grid_origin(spec)) / spec.cell_size).astype(int)
     index = index[np.all((index >= 0) & (index < spec.shape), axis=1)]
     cells = np.zeros(spec.shape, bool)
     cells[tuple(index.T)] = True
@@ -83,13 +86,13 @@ def junctions(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([centre[n] for n in kept]).reshape(-1, 2), np.array([height[n] for n in kept])
 
 
-def landmarks(config: slam.Config, scans: Scan) -> Nodes:
+def landmarks(config: Config, scans: Scan) -> Features:
     """Landmarks of scans [N]; their covariance is not known.
 
     Those whose circles come within a cell of what was not seen are not trusted.
     """
     ends, free = jax.tree.map(np.asarray, _seen(config, scans))
-    hit, spec = np.asarray(scans.hit), config.grid
+    hit, spec = np.asarray(scans.hit), config.frontend.grid
     count = len(hit)
     xy, clearance = np.zeros((count, SLOTS, 2)), np.zeros((count, SLOTS))
     valid, known = np.zeros((count, SLOTS), bool), np.zeros((count, SLOTS), bool)
@@ -100,18 +103,20 @@ def landmarks(config: slam.Config, scans: Scan) -> Nodes:
         seen = open | ndimage.binary_dilation(solid, np.ones((3, 3)))
         away = room(seen)[tuple(np.round(at).astype(int).T)]
         k = min(SLOTS, len(at))
-        xy[n, :k] = grid.corner(spec) + (at[:k] + 0.5) * spec.cell
-        clearance[n, :k], valid[n, :k] = height[:k] * spec.cell, True
+        xy[n, :k] = grid.grid_origin(spec) + (at[:k] + 0.5) * spec.cell_size
+        clearance[n, :k], valid[n, :k] = height[:k] * spec.cell_size, True
         known[n, :k] = (away > height + 1.0)[:k]
     zero = np.zeros((count, SLOTS))
-    fits = (clearance >= config.nodes.least) & (clearance <= config.nodes.most)
-    return Nodes(
-        kind=np.full(valid.shape, NODE),
+    fits = (clearance >= config.frontend.features.min_clearance) & (
+        clearance <= config.frontend.features.max_clearance
+    )
+    return Features(
+        kind=np.full(valid.shape, JUNCTION),
         xy=xy,
         cov=np.full((count, SLOTS, 2, 2), np.nan),
         direction=zero,
-        variance=zero,
-        shape=clearance,
+        direction_variance=zero,
+        descriptor=clearance,
         degree=3 * valid,
         certified=known,
         trusted=known & fits,

@@ -15,13 +15,16 @@ import jax
 import numpy as np
 
 from experiments import common, recovery, search
-from jaxslam import fit, monte_carlo, slam
-from jaxslam import logs as log_of
-from jaxslam.batches import use_cores
+from jaxslam.cli.options import enable_caches
+from jaxslam.core.devices import use_cpu_devices
+from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import mrclam
-from jaxslam.losses import calibrated, likelihood
-from jaxslam.noise import log_noise, sighting_noise
-from jaxslam.options import keep_compiled
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import trials
+from jaxslam.tuning import fitting
+from jaxslam.tuning.losses import innovation_nll, pose_nll
 
 NAME = "tuning"
 TRAIN, JUDGE = (1, 2, 3), (4, 5)  # robots of MRCLAM
@@ -41,24 +44,34 @@ STYLES = {
 
 def office(seed: int, runs: int, heldout: int) -> search.Task:
     """Simulated drives; by hand: the noise for a robot that nothing is known of."""
-    config = slam.Config(landmarks=LANDMARKS)
+    config = Config(
+        filter=FilterConfig(
+            max_landmarks=LANDMARKS,
+        ),
+    )
     place, robot, path, scans = common.scene()
     total = runs + heldout
-    logs = monte_carlo.simulate(
-        jax.random.key(seed), config, place, robot, path, runs=total, steps=scans
+    logs = trials.simulate_episodes(
+        jax.random.key(seed), config, robot, place, path, num_trials=total, num_scans=scans
     )
     train, test = (common.part(logs, part) for part in (slice(runs), slice(runs, total)))
-    return search.Task(config, log_noise(), train, test)
+    return search.Task(config, NoiseParams.for_laser_log(), train, test)
 
 
 def recorded(folder: Path) -> search.Task:
     """Drives of MRCLAM; by hand: range 0.15 m, bearing 0.03 rad, odometry 10 %."""
     every = [mrclam.read(folder, robot) for robot in TRAIN + JUDGE]
-    logs = [log_of.from_sightings(one) for one in every]
+    logs = [episodes.episode_from_landmark_log(one) for one in every]
     parts = logs[: len(TRAIN)], logs[len(TRAIN) :]
-    train, test = (log_of.stack(part) for part in parts)
+    train, test = (episodes.stack_episodes(part) for part in parts)
     # There are no walls.
-    return search.Task(log_of.config_of(every), sighting_noise(), train, test, ("wall",))
+    return search.Task(
+        episodes.landmark_log_config(every),
+        NoiseParams.for_landmark_sensor(),
+        train,
+        test,
+        ("wall",),
+    )
 
 
 def compare(
@@ -77,12 +90,12 @@ def compare(
 
         traces[method] = kept(f"{data} {method}", timed)
 
-    for method, loss in (("gradient", calibrated), ("likelihood", likelihood)):
+    for method, loss in (("gradient", pose_nll), ("likelihood", innovation_nll)):
         run(method, loss, lambda loss=loss: search.by_gradient(task, loss, steps))
     own = traces["gradient"]
     limits = LONGER * own["seconds"], own["evaluations"]
     for method in search.methods():
-        run(method, calibrated, lambda m=method: search.by_search(task, m, seed, *limits))
+        run(method, pose_nll, lambda m=method: search.by_search(task, m, seed, *limits))
     first = own["points"][0]
     rows = [_row(data, "hand", first, 0.0, 0, own, first)]
     for method, trace in traces.items():
@@ -94,14 +107,14 @@ def compare(
 
 def step_seconds(task: search.Task) -> common.Numbers:
     """Seconds of one step of tuning over many runs, compiled; the training runs again and again."""
-    runs = len(task.train.motion)
+    runs = len(task.train.odometry)
     logs = common.part(task.train, np.arange(STEP_RUNS) % runs)
     taken = []
     for _ in range(3):
         begin = perf_counter()
-        fit.gradients(task.hand, task.config, logs)
+        fitting.gradients(task.config, task.hand, logs)
         taken.append(perf_counter() - begin)
-    return {"runs": STEP_RUNS, "scans": logs.motion.shape[1], "seconds": sorted(taken)[1]}
+    return {"runs": STEP_RUNS, "scans": logs.odometry.shape[1], "seconds": sorted(taken)[1]}
 
 
 def _row(
@@ -174,12 +187,12 @@ def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
     sizes = {"runs": 32, "heldout": 64, "starts": 20, "recovery_runs": 256}
     given = common.parse(__doc__, argv, mrclam="", **sizes)
-    use_cores()
-    keep_compiled()
+    use_cpu_devices()
+    enable_caches()
     about = {key: str(value) for key, value in vars(given).items() if key != "out"}
     kept = common.Kept(given.out / f"{NAME}_parts", about)
     rows, traces = [], {}
-    tasks = {"office": lambda: office(given.seed, given.runs, given.heldout)}
+    tasks = {"office": lambda: office(given.seed, given.frontend.segments, given.heldout)}
     if given.mrclam:
         robots = recorded(Path(given.mrclam))
         tasks["mrclam"] = lambda: robots

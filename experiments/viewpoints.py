@@ -9,11 +9,15 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from experiments import truth
-from jaxslam import lidar, medial, slam
-from jaxslam.batches import map_batches
-from jaxslam.lidar import Lidar
-from jaxslam.types import CORNER, NODE
-from jaxslam.world import PLAN_WALLS, World
+from jaxslam.core.batching import map_batches
+from jaxslam.core.scan import Lidar
+from jaxslam.core.types import CORNER, JUNCTION
+from jaxslam.frontend import extract
+from jaxslam.mapping import medial_axis
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import ray_casting
+from jaxslam.simulation.floor_plans import PLAN_WALLS
+from jaxslam.simulation.worlds import World
 
 ROOM = 0.35  # [m] from a viewpoint to the nearest wall
 BEAMS = 5  # on each wall of a visible corner
@@ -27,61 +31,63 @@ class Drawn:
     """A world of walls."""
 
     known_from = "exact, from the walls"
-    kinds = {"node": NODE, "corner": CORNER}
+    kinds = {"node": JUNCTION, "corner": CORNER}
 
     def __init__(self, walls: np.ndarray):
         """Work out what is true of walls (S, 4) [m]."""
-        self.walls = truth.solid(walls)
-        self.free = truth.Free(self.walls)
-        self.junctions = truth.junctions(self.walls, self.free).xy
-        self.corners = truth.corners(self.walls)
-        ends = self.walls.reshape(-1, 2)
+        self.max_walls = truth.solid(walls)
+        self.free = truth.Free(self.max_walls)
+        self.junctions = truth.junctions(self.max_walls, self.free).xy
+        self.max_corners = truth.max_corners(self.max_walls)
+        ends = self.max_walls.reshape(-1, 2)
         self.box = ends.min(axis=0), ends.max(axis=0)
 
     def holds(self, places: np.ndarray) -> np.ndarray:
         """Whether a robot fits at places (N, 2) [m]."""
-        return self.free.holds(places) & (truth.clearance(places, self.walls) > ROOM)
+        return self.free.holds(places) & (truth.clearance(places, self.max_walls) > ROOM)
 
     def in_sight(self, eyes: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Whether places (N, K, 2) are in sight of eyes (N, 2): (N, K) bool."""
-        return truth.in_sight(eyes, places, self.walls)
+        return truth.in_sight(eyes, places, self.max_walls)
 
     def ranges(self, poses: np.ndarray, scanner: Lidar) -> np.ndarray:
         """Exact ranges (N, R) [m] of scans from poses (N, 3)."""
-        walls = np.pad(self.walls, ((0, PLAN_WALLS - len(self.walls)), (0, 0)))
+        walls = np.pad(self.max_walls, ((0, PLAN_WALLS - len(self.max_walls)), (0, 0)))
         return np.asarray(_cast(jnp.asarray(walls, float), jnp.asarray(poses, float), scanner))
 
 
 @partial(jax.jit, static_argnames="scanner")
 def _cast(walls, poses, scanner: Lidar):
-    one = lambda pose: lidar.cast(World(walls), pose, scanner).ranges
-    return map_batches(one, poses, size=slam.BATCH)
+    one = lambda pose: ray_casting.cast(scanner, World(walls), pose).ranges
+    return map_batches(one, poses, batch_size=extract.SCAN_BATCH)
 
 
 class Cells:
     """A map of cells, in the frame of its first corner: what is not free is solid."""
 
     known_from = f"Voronoi diagram of {POINTS} points on each side of a solid cell"
-    kinds = {"node": NODE}  # its steps have corners, but none that one should see
+    kinds = {"node": JUNCTION}  # its steps have corners, but none that one should see
 
     def __init__(self, occupied: np.ndarray, free: np.ndarray, resolution: float):
         """Work out what is true of cells (H, W) bool of a side of `resolution` [m]."""
-        self.cell = resolution
-        self.free = medial.free_space(
-            occupied, free, speck=SPECK / resolution, gap=GAP / resolution
+        self.cell_size = resolution
+        self.free = medial_axis.free_space(
+            occupied, free, min_obstacle_size=SPECK / resolution, min_unknown_size=GAP / resolution
         )
-        self.inside = medial.places(self.free, clearance=ROOM / resolution).inside == 1
+        self.region = (
+            medial_axis.free_configurations(self.free, clearance=ROOM / resolution).region == 1
+        )
         self.junctions = _junctions(self.free) * resolution
         self.box = np.zeros(2), resolution * np.array(free.shape)
 
     def _at(self, cells: np.ndarray, places: np.ndarray) -> np.ndarray:
-        index = np.floor(places / self.cell).astype(int)
+        index = np.floor(places / self.cell_size).astype(int)
         inside = np.all((index >= 0) & (index < cells.shape), axis=-1)
         return inside & cells[tuple(np.where(inside[..., None], index, 0).T)].T
 
     def holds(self, places: np.ndarray) -> np.ndarray:
         """Whether a robot fits at places (N, 2) [m] and can come from everywhere else."""
-        return self._at(self.inside, places)
+        return self._at(self.region, places)
 
     def in_sight(self, eyes: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Whether places (N, K, 2) are in sight of eyes (N, 2): (N, K) bool."""
@@ -92,7 +98,11 @@ class Cells:
 
     def ranges(self, poses: np.ndarray, scanner: Lidar) -> np.ndarray:
         """Exact ranges (N, R) [m] of scans from poses (N, 3)."""
-        turn = poses[:, 2:] + scanner.first + scanner.step * np.arange(scanner.beams)
+        turn = (
+            poses[:, 2:]
+            + scanner.angle_min
+            + scanner.angle_increment * np.arange(scanner.num_beams)
+        )
         beams = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
         return self.reach(np.broadcast_to(poses[:, None, :2], beams.shape), beams)
 
@@ -104,7 +114,7 @@ class Cells:
         References:
             Amanatides, Woo (1987), A fast voxel traversal algorithm for ray tracing.
         """
-        eye, beam = eyes.reshape(-1, 2) / self.cell, beams.reshape(-1, 2)
+        eye, beam = eyes.reshape(-1, 2) / self.cell_size, beams.reshape(-1, 2)
         beam = np.where(np.abs(beam) < 1e-12, 1e-12, beam)
         index = np.floor(eye).astype(int)
         due = (index + (beam > 0) - eye) / beam  # [cells] of way to the next border, by axis
@@ -120,7 +130,7 @@ class Cells:
             open = inside & self.free[tuple(np.where(inside[:, None], index, 0).T)]
             result[left[inside & ~open]] = way[inside & ~open]
             left, due, index, every, step = (x[open] for x in (left, due, index, every, step))
-        return self.cell * result.reshape(eyes.shape[:-1])
+        return self.cell_size * result.reshape(eyes.shape[:-1])
 
 
 def _junctions(free: np.ndarray) -> np.ndarray:
@@ -164,11 +174,11 @@ class Scene(NamedTuple):
     def take(self, pairs: np.ndarray) -> "Scene":
         """The scene of some pairs (N,) bool alone."""
         both = np.tile(pairs, 2)
-        return Scene(self.place, self.poses[both], self.ranges[both], self.corners[both])
+        return Scene(self.place, self.poses[both], self.ranges[both], self.max_corners[both])
 
 
 def scene(
-    place: Drawn | Cells, rng: np.random.Generator, pairs: int, apart: float, config: slam.Config
+    place: Drawn | Cells, rng: np.random.Generator, pairs: int, apart: float, config: Config
 ) -> Scene:
     """Pairs of viewpoints of any heading in a place, at most `apart` [m] from each other."""
     kept = np.zeros((0, 4))
@@ -183,9 +193,9 @@ def scene(
     places = kept[:pairs].reshape(pairs, 2, 2).transpose(1, 0, 2).reshape(-1, 2)
     poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, 2 * pairs)])
     corners = np.zeros((2 * pairs, 0), bool)
-    if "corner" in place.kinds:
+    if "corner" in place.filter.landmark_kinds:
         corners = visible_corners(place, poses, config)
-    return Scene(place, poses, place.ranges(poses, config.lidar), corners)
+    return Scene(place, poses, place.ranges(poses, config.frontend.lidar), corners)
 
 
 def _turns(poses: np.ndarray) -> np.ndarray:
@@ -204,17 +214,21 @@ def turned(poses: np.ndarray, cov: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nmjk,nlk->nmil", turn, cov, turn)
 
 
-def in_view(poses: np.ndarray, places: np.ndarray, config: slam.Config) -> np.ndarray:
+def in_view(poses: np.ndarray, places: np.ndarray, config: Config) -> np.ndarray:
     """Whether places (N, K, 2) [m, world] are in the view of poses (N, 3), and on their grid."""
     offset = places - poses[:, None, :2]
     bearing = np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, None, 2]
-    bearing = (bearing - config.lidar.first) % (2 * np.pi)
+    bearing = (bearing - config.frontend.lidar.angle_min) % (2 * np.pi)
     away = np.hypot(offset[..., 0], offset[..., 1])
-    reach = min(config.lidar.reach, config.grid.ahead, config.grid.side)
-    return (bearing <= (config.lidar.beams - 1) * config.lidar.step) & (away < reach)
+    reach = min(
+        config.frontend.lidar.range_max, config.frontend.grid.x_max, config.frontend.grid.y_half
+    )
+    return (
+        bearing <= (config.frontend.lidar.num_beams - 1) * config.frontend.lidar.angle_increment
+    ) & (away < reach)
 
 
-def visible_circles(place, poses, centres, radii, config: slam.Config) -> np.ndarray:
+def visible_circles(place, poses, centres, radii, config: Config) -> np.ndarray:
     """Whether circles, centres (N, 2) and radii (N,), are wholly in view of poses (N, 3)."""
     rim = np.stack([np.cos(RIM), np.sin(RIM)], axis=-1)
     rim = centres[:, None] + 0.95 * radii[:, None, None] * rim
@@ -223,16 +237,18 @@ def visible_circles(place, poses, centres, radii, config: slam.Config) -> np.nda
     return seen
 
 
-def visible_corners(place: Drawn, poses: np.ndarray, config: slam.Config) -> np.ndarray:
+def visible_corners(place: Drawn, poses: np.ndarray, config: Config) -> np.ndarray:
     """Whether poses (N, 3) see corners, and either wall of them with five beams: (N, C) bool."""
-    turn = config.lidar.first + config.lidar.step * np.arange(config.lidar.beams)
-    corner, along = place.corners
+    turn = config.frontend.lidar.angle_min + config.frontend.lidar.angle_increment * np.arange(
+        config.frontend.lidar.num_beams
+    )
+    corner, along = place.max_corners
     result = np.zeros((len(poses), len(corner)), bool)
     for n, pose in enumerate(poses):
         near = corner + 1e-6 * (pose[:2] - corner)
         seen = place.in_sight(pose[None, :2], near[None])
         seen = np.flatnonzero((seen & in_view(pose[None], near[None], config))[0])
-        ends = truth.hits(pose[:2], pose[2] + turn, place.walls)
+        ends = truth.hits(pose[:2], pose[2] + turn, place.max_walls)
         offset = (ends[:, None] - corner[seen])[:, :, None]  # (R, C, 1, 2)
         ahead = np.sum(offset * along[seen], axis=-1)
         across = np.sum(offset * along[seen][..., ::-1] * [1, -1], axis=-1)

@@ -13,12 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam import ekf, sensor
-from jaxslam.batches import map_batches
-from jaxslam.belief import Belief, initial, know
-from jaxslam.conditioning import log_likelihood
-from jaxslam.nodes import from_polar
-from jaxslam.types import Array
+from jaxslam.core.batching import map_batches
+from jaxslam.core.types import Array
+from jaxslam.filtering import ekf, kalman, map_management, measurement_model
+from jaxslam.filtering.belief import Belief, add_known_landmarks, initial_belief
+from jaxslam.frontend.features import features_from_range_bearing
 
 TOGETHER = 8  # runs filtered together: of 4, 8, 16, 32 the best for the gradient
 
@@ -152,15 +151,15 @@ def circle(seed: int, runs: int) -> Drive:
 def _polar_cov(xy: Array, variance: float) -> Array:
     """Covariances (..., 2, 2) of range and bearing of points (..., 2) of one variance."""
     cov = variance * jnp.eye(2, dtype=xy.dtype)
-    flat = jax.vmap(sensor.polar_cov, in_axes=(0, None))(xy.reshape(-1, 2), cov)
+    flat = jax.vmap(measurement_model.polar_cov, in_axes=(0, None))(xy.reshape(-1, 2), cov)
     return flat.reshape(xy.shape + (2,))
 
 
 def _start(linearisation: str, run: Drive) -> Belief:
-    belief = initial(jnp.zeros(3, run.motion.dtype), landmarks=run.prior.shape[0])
-    belief = know(belief, run.prior, run.prior_cov)
+    belief = initial_belief(jnp.zeros(3, run.motion.dtype), max_landmarks=run.prior.shape[0])
+    belief = add_known_landmarks(belief, run.prior, run.prior_cov)
     given = jnp.any(run.prior_cov != 0.0, axis=(1, 2))
-    return belief._replace(seen=jnp.where(given, 1, 0).astype(jnp.int32))
+    return belief._replace(num_seen=jnp.where(given, 1, 0).astype(jnp.int32))
 
 
 def step(
@@ -169,7 +168,7 @@ def step(
     """One step, known association; what is seen first is taken in, if the map `grows`.
 
     Args:
-        linearisation: One of `ekf.LINEARISATIONS`.
+        linearisation: One of `LINEARISATIONS`.
         q: (3, 3) covariance of the odometry.
         belief: After the step before.
         now: Odometry (3,), range and bearing (M, 2), whose they are (M,), covariances (M, 2, 2).
@@ -177,18 +176,20 @@ def step(
     """
     how = {"linearisation": linearisation}
     motion, polar, who, r = now
-    size = belief.seen.size
+    size = belief.num_seen.size
     belief = ekf.predict(belief, motion, q, **how)
-    features = from_polar(polar, who >= 0)
-    known = (who >= 0) & (belief.seen.at[who].get(mode="fill", fill_value=0) > 0)
-    rows = ekf.innovations(belief, features, r, jnp.where(known, who, size), **how)
+    features = features_from_range_bearing(polar, who >= 0)
+    known = (who >= 0) & (belief.num_seen.at[who].get(mode="fill", fill_value=0) > 0)
+    rows = ekf.linearize(belief, features, r, jnp.where(known, who, size), **how)
     belief, done = ekf.update(belief, rows, **how)
     if grows:
         new, at = (who >= 0) & ~known, jnp.where(who >= 0, who, size)
-        belief, _ = ekf.augment(belief, features, r, new, most=who.size, at=at, **how)
+        belief, _ = map_management.augment(
+            belief, features, r, new, max_new=who.size, new_slot=at, **how
+        )
     dof = 2 * jnp.sum(known, dtype=jnp.int32)
-    likely = log_likelihood(done, dof)
-    return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, likely, done.good)
+    likely = kalman.log_likelihood(done, dof)
+    return belief, Steps(belief.pose, belief.pose_cov, done.nis, dof, likely, done.ok)
 
 
 def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:
@@ -201,7 +202,7 @@ def filter_one(linearisation: str, run: Drive, *, grows: bool = True) -> Steps:
 @partial(jax.jit, static_argnums=0)
 def filtered(linearisation: str, drive: Drive) -> Steps:
     """Filter B runs, a few together, which stay in the cache."""
-    return map_batches(partial(filter_one, linearisation), drive, size=TOGETHER)
+    return map_batches(partial(filter_one, linearisation), drive, batch_size=TOGETHER)
 
 
 def as_floats(drive: Drive, dtype: type = np.float32) -> Drive:

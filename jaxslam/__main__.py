@@ -2,6 +2,6 @@
 
 import sys
 
-from jaxslam.cli import main
+from jaxslam.cli.main import main
 
 sys.exit(main())

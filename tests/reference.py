@@ -83,7 +83,7 @@ def seen_free(ranges, first, step, spec):
     """Cells whose centre is nearer than the ends of the beams on either side of it."""
     free = np.zeros(spec.shape, bool)
     for i, j in np.ndindex(*spec.shape):
-        x, y = (i + 0.5) * spec.cell - spec.behind, (j + 0.5) * spec.cell - spec.side
+        x, y = (i + 0.5) * spec.cell_size + spec.x_min, (j + 0.5) * spec.cell_size - spec.y_half
         beam = (math.atan2(y, x) - first) / step
         if 0 <= beam < len(ranges) - 1:
             free[i, j] = math.hypot(x, y) < min(ranges[int(beam)], ranges[int(beam) + 1])

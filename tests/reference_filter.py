@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxslam.types import WALL
+from jaxslam.core.types import WALL
 
 
 def wrap(angle):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from jaxslam import world
+from jaxslam.simulation import worlds
 
 LEG = 3 * np.sqrt(3)  # [m] height of a triangle with sides of 6 m
-TRIANGLE = world.polyline([(0, 0), (LEG, -3), (LEG, 3), (0, 0)])
+TRIANGLE = worlds.polyline([(0, 0), (LEG, -3), (LEG, 3), (0, 0)])
 CENTRE, RADIUS = np.array([2 * LEG / 3, 0.0]), LEG / 3
 IN_TRIANGLE = np.array([1.5, 0.3, 0.05])

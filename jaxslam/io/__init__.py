@@ -1,1 +1,1 @@
-"""Reading logs and writing results: one module per format; no other module accesses files."""
+"""TODO."""

@@ -7,7 +7,7 @@
 All other messages and comments are ignored, and so is ROBOTLASER1 in a log with FLASER, where both
 hold the same scans. Poses of ROBOTLASER1 are those of the laser. Where the odometry restarts, or
 the poses of the scans were corrected by another program, the odometry is rebuilt from the ODOM
-lines, and `Recording.mended` says so.
+lines, and `LaserLog.odometry_repairs` says so.
 """
 
 import math
@@ -16,14 +16,20 @@ from os import PathLike
 
 import numpy as np
 
+from jaxslam.core.logs import (
+    DEFAULT_RANGE_MAX,
+    DEFAULT_RANGE_STD,
+    MAX_BROKEN_FRACTION,
+    LaserLog,
+    mark_no_return,
+)
+from jaxslam.core.scan import Lidar
+from jaxslam.core.time_series import interpolate_poses, sort_by_time
 from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, REACH, TOLERATED, Recording, no_return
-from jaxslam.io.robotlaser import Laser
+from jaxslam.io.odometry_repair import poses_are_corrected, remove_jumps
+from jaxslam.io.robotlaser import RobotLaser
 from jaxslam.io.text import lines, number
-from jaxslam.io.wheels import foreign, without_jumps
-from jaxslam.lidar import Lidar
-from jaxslam.poses import by_time, interpolate
 
 _FORMS = {
     b"ODOM": "ODOM x y theta tv rv accel ipc_time host logger_time",
@@ -41,22 +47,22 @@ _Broken = dict[int, tuple[bytes, str]]
 """Keyword of each broken line and what is wrong with it, by line number."""
 
 
-def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
+def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> LaserLog:
     """Read a CARMEN log, plain or gzipped, in file order.
 
     Args:
         path: The log.
-        reach: Range [m] from which on a reading counts as no return; so does one <= 0.
+        range_max: Range [m] from which on a reading counts as no return; so does one <= 0.
 
     Raises:
         InputError: The file cannot be read or is no CARMEN log, more than 5 % of its ODOM and
             FLASER lines are broken, there is no scan, or its odometry never changes.
     """
-    if not 0.0 < reach < math.inf:
-        raise InputError(f"range_max {reach} m", advice="give a positive number of metres")
+    if not 0.0 < range_max < math.inf:
+        raise InputError(f"range_max {range_max} m", advice="give a positive number of metres")
     odometry: list[_StampedPose] = []
     flaser: list[_FlaserScan] = []
-    robotlaser1: dict[int, Laser] = {}
+    robotlaser1: dict[int, RobotLaser] = {}
     broken: _Broken = {}
     for line, text in lines(path):
         fields = text.split()
@@ -74,10 +80,10 @@ def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
     unused = b"FLASER" if use_robotlaser1 else b"ROBOTLASER1"
     broken = {line: problem for line, problem in broken.items() if problem[0] != unused}
     if use_robotlaser1:
-        robotlaser1, other_scanner = robotlaser.alike(robotlaser1)
+        robotlaser1, other_scanner = robotlaser.same_scanner(robotlaser1)
         broken |= {line: (b"ROBOTLASER1", problem) for line, problem in other_scanner.items()}
         _check_broken(path, broken, len(odometry) + len(robotlaser1) + len(broken))
-        return _from_robotlaser1(path, odometry, list(robotlaser1.values()), len(broken), reach)
+        return _from_robotlaser1(path, odometry, list(robotlaser1.values()), len(broken), range_max)
     if not odometry and not flaser and not broken:
         advice = "name a CARMEN log; other formats have other readers"
         raise InputError("has neither FLASER nor ODOM lines", path=path, advice=advice)
@@ -88,7 +94,7 @@ def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
     if not flaser:
         problem = f"has no usable FLASER line among its {total} FLASER and ODOM lines"
         raise InputError(problem, path=path, advice="name a log that holds laser scans")
-    return _from_flaser(path, odometry, flaser, len(broken), reach)
+    return _from_flaser(path, odometry, flaser, len(broken), range_max)
 
 
 def _parse_odom(fields: list[bytes]) -> _StampedPose:
@@ -145,8 +151,8 @@ def _with_usual_beam_count(scans: list[_FlaserScan]) -> tuple[list[_FlaserScan],
 
 
 def _check_broken(path: str | PathLike, broken: _Broken, total: int) -> None:
-    """Raise if more of `total` lines are broken than `TOLERATED` allows."""
-    if len(broken) <= TOLERATED * total:
+    """Raise if more of `total` lines are broken than `MAX_BROKEN_FRACTION` allows."""
+    if len(broken) <= MAX_BROKEN_FRACTION * total:
         return
     line = min(broken)
     keyword, reason = broken[line]
@@ -161,27 +167,29 @@ def _from_flaser(
     scans: list[_FlaserScan],
     skipped: int,
     range_max: float,
-) -> Recording:
+) -> LaserLog:
     """The log of FLASER lines."""
     stamped_poses = np.array([stamped_pose for _, stamped_pose, _ in scans])
-    ranges = no_return(np.array([ranges for _, _, ranges in scans]), range_max)
-    lidar = layout(ranges.shape[1], range_max)
+    ranges = mark_no_return(np.array([ranges for _, _, ranges in scans]), range_max)
+    lidar = half_circle_lidar(ranges.shape[1], range_max)
     return _build_log(path, odometry, stamped_poses, ranges, lidar, skipped)
 
 
 def _from_robotlaser1(
     path: str | PathLike,
     odometry: list[_StampedPose],
-    scans: list[Laser],
+    scans: list[RobotLaser],
     skipped: int,
     range_max: float,
-) -> Recording:
+) -> LaserLog:
     """The log of ROBOTLASER1 lines."""
     stamped_poses = np.array([(scan.time, *scan.pose) for scan in scans])
     first = scans[0]
-    range_max = min(range_max, first.reach)
-    ranges = no_return(np.array([scan.ranges for scan in scans]), range_max)
-    lidar = Lidar(ranges.shape[1], first.first, first.step, range_max, NOISE)
+    range_max = min(range_max, first.range_max)
+    ranges = mark_no_return(np.array([scan.ranges for scan in scans]), range_max)
+    lidar = Lidar(
+        ranges.shape[1], first.angle_min, first.angle_increment, range_max, DEFAULT_RANGE_STD
+    )
     return _build_log(path, odometry, stamped_poses, ranges, lidar, skipped)
 
 
@@ -192,7 +200,7 @@ def _build_log(
     ranges: np.ndarray,
     lidar: Lidar,
     skipped: int,
-) -> Recording:
+) -> LaserLog:
     """Combine scans and odometry, and repair the odometry where it restarts or was corrected.
 
     Args:
@@ -208,9 +216,11 @@ def _build_log(
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
     stream = np.array(odometry) if odometry else stamped_poses  # (N, 4)
     times, odom_times = stamped_poses[:, 0].copy(), stream[:, 0].copy()
-    corrected = bool(odometry) and foreign(times, stamped_poses[:, 1:], odom_times, stream[:, 1:])
-    odom_poses, restarts = without_jumps(odom_times, stream[:, 1:].copy())
-    if restarts > TOLERATED * len(stream):
+    corrected = bool(odometry) and poses_are_corrected(
+        times, stamped_poses[:, 1:], odom_times, stream[:, 1:]
+    )
+    odom_poses, restarts = remove_jumps(odom_times, stream[:, 1:].copy())
+    if restarts > MAX_BROKEN_FRACTION * len(stream):
         problem = f"its odometry jumps {restarts} times in {len(stream)} lines"
         raise InputError(problem, path=path, advice="name a log with wheel odometry")
     repairs = []
@@ -220,27 +230,27 @@ def _build_log(
         repairs.append("poses of the scans are not odometry: ODOM lines are used instead")
     scan_poses = stamped_poses[:, 1:].copy()
     if odometry and repairs:
-        scan_poses = interpolate(times, *by_time(odom_times, odom_poses))
+        scan_poses = interpolate_poses(times, *sort_by_time(odom_times, odom_poses))
     elif not odometry:
         scan_poses = odom_poses.copy()
-    return Recording(
+    return LaserLog(
         times=times,
-        odometry=scan_poses,
+        odom_poses=scan_poses,
         ranges=ranges,
         lidar=lidar,
-        skipped=skipped,
-        wheel_times=odom_times,
-        wheel_poses=odom_poses,
-        mended=tuple(repairs),
+        num_skipped=skipped,
+        odom_stream_times=odom_times,
+        odom_stream_poses=odom_poses,
+        odometry_repairs=tuple(repairs),
     )
 
 
-def layout(beams: int, reach: float) -> Lidar:
+def half_circle_lidar(num_beams: int, range_max: float) -> Lidar:
     """Lidar of a half circle from -90 degrees on; an odd count of beams includes +90 degrees.
 
     Args:
-        beams: Number of beams, at least 2.
-        reach: Range [m] from which on a reading counts as no return.
+        num_beams: Number of beams, at least 2.
+        range_max: Range [m] from which on a reading counts as no return.
     """
-    intervals = beams - 1 if beams % 2 else beams
-    return Lidar(beams, -math.pi / 2, math.pi / intervals, float(reach), NOISE)
+    intervals = num_beams - 1 if num_beams % 2 else num_beams
+    return Lidar(num_beams, -math.pi / 2, math.pi / intervals, float(range_max), DEFAULT_RANGE_STD)

@@ -14,13 +14,19 @@ from os import PathLike
 
 import numpy as np
 
+from jaxslam.core.logs import (
+    DEFAULT_RANGE_MAX,
+    DEFAULT_RANGE_STD,
+    MAX_BROKEN_FRACTION,
+    LaserLog,
+    mark_no_return,
+)
+from jaxslam.core.scan import Lidar
+from jaxslam.core.se2_np import chain
 from jaxslam.io import robotlaser
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import NOISE, REACH, TOLERATED, Recording, no_return
-from jaxslam.io.robotlaser import Laser
+from jaxslam.io.robotlaser import RobotLaser
 from jaxslam.io.text import lines, number
-from jaxslam.lidar import Lidar
-from jaxslam.poses import chain
 
 _FORMS = {
     b"VERTEX_SE2": "VERTEX_SE2 id x y theta",
@@ -29,22 +35,22 @@ _FORMS = {
 }
 
 
-def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
+def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> LaserLog:
     """Read a pose graph with scans: plain, gzipped, or the one file in a zip archive.
 
     Args:
         path: The file.
-        reach: Range [m] from which on a reading counts as no return, unless the range_max of the
+        range_max: Range [m] from which on a reading counts as no return, unless the range_max of the
             scans is smaller; so does one <= 0.
 
     Raises:
         InputError: The file cannot be read, has no scan or no odometry from one vertex to the
             next, a vertex or edge is broken, or more than 5 % of the scans.
     """
-    if not 0.0 < reach < math.inf:
-        raise InputError(f"range_max {reach} m", advice="give a positive number of metres")
+    if not 0.0 < range_max < math.inf:
+        raise InputError(f"range_max {range_max} m", advice="give a positive number of metres")
     vertices: list[int] = []  # ids in file order
-    scans: dict[int, Laser] = {}
+    scans: dict[int, RobotLaser] = {}
     edges: dict[tuple[int, int], tuple[float, ...]] = {}
     broken: dict[int, str] = {}
     for line, text in lines(path):
@@ -71,10 +77,10 @@ def read(path: str | PathLike, *, reach: float = REACH) -> Recording:
     if len(set(vertices)) < len(vertices):
         duplicate = Counter(vertices).most_common(1)[0][0]
         raise InputError(f"vertex {duplicate} occurs twice", path=path, advice="renumber them")
-    scans, other_scanner = robotlaser.alike(scans)
+    scans, other_scanner = robotlaser.same_scanner(scans)
     broken |= other_scanner
     _check_scans(path, scans, broken)
-    return _build_log(path, vertices, scans, edges, len(broken), reach)
+    return _build_log(path, vertices, scans, edges, len(broken), range_max)
 
 
 def _vertex_id(fields: list[bytes], count: int, index: int) -> int:
@@ -87,13 +93,15 @@ def _vertex_id(fields: list[bytes], count: int, index: int) -> int:
     return int(value)
 
 
-def _check_scans(path: str | PathLike, scans: dict[int, Laser], broken: dict[int, str]) -> None:
-    """Raise if there are no scans, or more are broken than `TOLERATED` allows."""
+def _check_scans(
+    path: str | PathLike, scans: dict[int, RobotLaser], broken: dict[int, str]
+) -> None:
+    """Raise if there are no scans, or more are broken than `MAX_BROKEN_FRACTION` allows."""
     total = len(scans) + len(broken)
     if not total:
         advice = "name a graph that holds its laser scans"
         raise InputError("has no ROBOTLASER1 lines", path=path, advice=advice)
-    if len(broken) > TOLERATED * total:
+    if len(broken) > MAX_BROKEN_FRACTION * total:
         line = min(broken)
         problem = f"{broken[line]} ({len(broken)} of {total} ROBOTLASER1 lines are broken)"
         advice = f"repair them, each is: {_FORMS[b'ROBOTLASER1']}"
@@ -103,11 +111,11 @@ def _check_scans(path: str | PathLike, scans: dict[int, Laser], broken: dict[int
 def _build_log(
     path: str | PathLike,
     vertices: list[int],
-    scans: dict[int, Laser],
+    scans: dict[int, RobotLaser],
     edges: dict[tuple[int, int], tuple[float, ...]],
     skipped: int,
     range_max: float,
-) -> Recording:
+) -> LaserLog:
     """Chain the odometry edges to poses, and keep those of vertices with a scan."""
     pairs = list(zip(vertices[:-1], vertices[1:], strict=True))
     for pair in pairs:
@@ -119,16 +127,18 @@ def _build_log(
     has_scan = np.array([vertex in scans for vertex in vertices])
     kept = [scans[vertex] for vertex in vertices if vertex in scans]
     first = kept[0]
-    range_max = min(range_max, first.reach)
-    ranges = no_return(np.array([scan.ranges for scan in kept]), range_max)
+    range_max = min(range_max, first.range_max)
+    ranges = mark_no_return(np.array([scan.ranges for scan in kept]), range_max)
     times = np.array([scan.time for scan in kept])
     scan_poses = poses[has_scan]
-    return Recording(
+    return LaserLog(
         times=times,
-        odometry=scan_poses,
+        odom_poses=scan_poses,
         ranges=ranges,
-        lidar=Lidar(ranges.shape[1], first.first, first.step, range_max, NOISE),
-        skipped=skipped,
-        wheel_times=times,
-        wheel_poses=scan_poses,
+        lidar=Lidar(
+            ranges.shape[1], first.angle_min, first.angle_increment, range_max, DEFAULT_RANGE_STD
+        ),
+        num_skipped=skipped,
+        odom_stream_times=times,
+        odom_stream_poses=scan_poses,
     )

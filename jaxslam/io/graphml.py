@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam.core.maps import TopologicalMap
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_text
-from jaxslam.topomap import Graph
 
 
 def require() -> None:
@@ -20,7 +20,7 @@ def require() -> None:
         raise InputError("networkx is needed to write map.graphml", advice=advice)
 
 
-def write(path: str | PathLike, graph: Graph) -> None:
+def write(path: str | PathLike, graph: TopologicalMap) -> None:
     """Write a map as an undirected multigraph.
 
     Nodes have `x`, `y` and `clearance`, edges `length` and `clearance`, all [m], and `line`, the
@@ -40,9 +40,9 @@ def write(path: str | PathLike, graph: Graph) -> None:
     for node, (x, y), clearance in zip(graph.id, graph.xy, graph.clearance, strict=True):
         attributes = {"x": float(x), "y": float(y)} | _finite({"clearance": clearance})
         multigraph.add_nodes_from([(int(node), attributes)])
-    for index, (start, end) in enumerate(graph.pairs):
-        numbers = {"length": graph.length[index], "clearance": graph.arc_clearance[index]}
-        attributes = {"line": _well_known_text(graph.lines[index])} | _finite(numbers)
+    for index, (start, end) in enumerate(graph.arc_ends):
+        numbers = {"length": graph.arc_length[index], "clearance": graph.arc_clearance[index]}
+        attributes = {"line": _well_known_text(graph.arc_lines[index])} | _finite(numbers)
         source, target = int(graph.id[start]), int(graph.id[end])
         multigraph.add_edges_from([(source, target, index, attributes)])
     write_text(path, "\n".join(networkx.generate_graphml(multigraph)) + "\n")

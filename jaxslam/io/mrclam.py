@@ -21,18 +21,18 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.core.logs import LandmarkLog
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import Sightings
 from jaxslam.io.text import table
 
-HOLD = 1.1
+MAX_HOLD = 1.1
 """Longest time [s] for which a velocity is held. These robots keep their velocity through gaps of
 the log, and stop by themselves after one second, when a line of zeros ends the gap."""
 
-NEAR = 0.2
+MAX_REFERENCE_GAP = 0.2
 """Longest gap [s] between two reference poses in which the reference is interpolated."""
 
-_TICK = 1e-6
+_TIME_TOLERANCE = 1e-6
 """Time [s] below any that matters: float64 resolves 1e9 s to 2e-7 s."""
 
 _FIELDS = {
@@ -68,7 +68,7 @@ def robots(path: str | PathLike) -> list[int]:
     return found
 
 
-def read(folder: str | PathLike, robot: int, *, longest: float = 1.0) -> Sightings:
+def read(folder: str | PathLike, robot: int, *, max_gap: float = 1.0) -> LandmarkLog:
     """Read the log of one robot: a step for each time at which it observes landmarks.
 
     Left out are measurements of other robots, and steps before the first line of odometry, after
@@ -78,7 +78,7 @@ def read(folder: str | PathLike, robot: int, *, longest: float = 1.0) -> Sightin
     Args:
         folder: Folder of a data set; the robot's own reference may be missing.
         robot: Number of the robot, one of `robots`.
-        longest: Longest time [s] between two steps: steps without landmarks are inserted in longer
+        max_gap: Longest time [s] between two steps: steps without landmarks are inserted in longer
             gaps, because motion noise that grows with distance and turn would otherwise miss
             motion forth and back.
 
@@ -87,8 +87,8 @@ def read(folder: str | PathLike, robot: int, *, longest: float = 1.0) -> Sightin
             itself, the robot observes no landmark while it has odometry, or no step has a
             reference although there are reference poses.
     """
-    if not longest >= 0.01:
-        raise InputError(f"longest {longest} s", advice="give at least 0.01 seconds")
+    if not max_gap >= 0.01:
+        raise InputError(f"longest {max_gap} s", advice="give at least 0.01 seconds")
     folder, available = Path(folder), robots(folder)
     if robot not in available:
         advice = f"choose from {', '.join(map(str, available))}"
@@ -102,22 +102,22 @@ def read(folder: str | PathLike, robot: int, *, longest: float = 1.0) -> Sightin
         path = folder / f"Robot{robot}_Measurement.dat"
         problem = "no landmark is measured within the time of the odometry"
         raise InputError(problem, path=path, advice="read another robot")
-    times = _step_times(np.unique(measured[:, 0]), longest)
+    times = _step_times(np.unique(measured[:, 0]), max_gap)
     truth, has_truth = _reference(folder, f"Robot{robot}_Groundtruth.dat", times)
     first = int(np.argmax(has_truth))
     times = times[first:]
     polar, valid, landmark = _pad(measured[measured[:, 0] >= times[0]], times)
-    return Sightings(
+    return LandmarkLog(
         times=times,
-        motion=_odometry_increments(odometry, times),
-        polar=polar,
+        odometry=_odometry_increments(odometry, times),
+        range_bearing=polar,
         valid=valid,
-        which=landmark,
+        landmark_index=landmark,
         truth=truth[first:],
-        referenced=has_truth[first:],
-        places=positions,
-        names=subjects,
-        skipped=skipped,
+        truth_mask=has_truth[first:],
+        landmark_positions=positions,
+        landmark_names=subjects,
+        num_skipped=skipped,
     )
 
 
@@ -191,7 +191,7 @@ def _measurements(
 def _step_times(times: np.ndarray, longest: float) -> np.ndarray:
     """All `times` (ascending), and evenly spaced ones in gaps longer than `longest`."""
     gaps = np.diff(times)
-    parts = np.maximum(np.ceil((gaps - _TICK) / longest), 1.0).astype(int)
+    parts = np.maximum(np.ceil((gaps - _TIME_TOLERANCE) / longest), 1.0).astype(int)
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     between = np.repeat(times[:-1], parts) + part * np.repeat(gaps / parts, parts)
     return np.append(between, times[-1])
@@ -206,7 +206,7 @@ def _odometry_increments(odometry: np.ndarray, times: np.ndarray) -> np.ndarray:
 
     def displacements(poses: np.ndarray, lines: np.ndarray, duration: np.ndarray) -> np.ndarray:
         """Motions (K, 3), world frame, from poses (K, 3) at velocities (K, 3)."""
-        duration = np.minimum(duration, HOLD)
+        duration = np.minimum(duration, MAX_HOLD)
         turn = lines[:, 2] * duration
         chord = lines[:, 1] * duration * np.sinc(turn / (2 * np.pi))
         middle = poses[:, 2] + turn / 2
@@ -215,7 +215,7 @@ def _odometry_increments(odometry: np.ndarray, times: np.ndarray) -> np.ndarray:
     # Dead reckoning: the poses at the lines, then at the times.
     durations = np.diff(odometry[:, 0])
     line_poses = np.zeros_like(odometry)
-    line_poses[1:, 2] = np.cumsum(odometry[:-1, 2] * np.minimum(durations, HOLD))
+    line_poses[1:, 2] = np.cumsum(odometry[:-1, 2] * np.minimum(durations, MAX_HOLD))
     moves = displacements(line_poses[:-1], odometry[:-1], durations)
     line_poses[1:, :2] = np.cumsum(moves[:, :2], axis=0)
     last = np.searchsorted(odometry[:, 0], times, side="right") - 1
@@ -241,7 +241,7 @@ def _reference(folder: Path, name: str, times: np.ndarray) -> tuple[np.ndarray, 
     after = np.searchsorted(known_times, times, side="left")
     inside = (before >= 0) & (after < known_times.size)
     gap = known_times[after % known_times.size] - known_times[before]
-    has_truth = inside & (gap <= NEAR + _TICK)
+    has_truth = inside & (gap <= MAX_REFERENCE_GAP + _TIME_TOLERANCE)
     if not has_truth.any():
         problem = "has no pose at any time at which a landmark is measured"
         raise InputError(problem, path=folder / name, advice="repair its times or remove it")

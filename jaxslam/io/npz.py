@@ -23,10 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.core.logs import DEFAULT_RANGE_STD, LaserLog, mark_no_return
+from jaxslam.core.scan import Lidar
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
-from jaxslam.io.recording import NOISE, Recording, no_return
-from jaxslam.lidar import Lidar
 
 FORMAT, VERSION = "jaxslam-recording", 1
 _REQUIRED = ("format", "version", "times", "odometry", "ranges", "first", "step", "reach")
@@ -35,36 +35,36 @@ _LIMITS = {"step": (1e-6, math.pi), "reach": (1e-3, 1e6), "noise": (1e-6, 1e3)}
 _ADVICE = f"it is a NumPy file with {', '.join(_REQUIRED)}"
 
 
-def write(path: str | PathLike, recording: Recording) -> None:
+def write(path: str | PathLike, log: LaserLog) -> None:
     """Write a laser log.
 
     Raises:
         InputError: The file cannot be written.
     """
-    lidar = recording.lidar
+    lidar = log.lidar
     with replace(Path(path)) as file:
         np.savez_compressed(
             file,
             format=FORMAT,
             version=VERSION,
-            times=recording.times,
-            odometry=recording.odometry,
-            ranges=recording.ranges,
-            wheel_times=recording.wheel_times,
-            wheel_poses=recording.wheel_poses,
-            first=lidar.first,
-            step=lidar.step,
-            reach=lidar.reach,
-            noise=lidar.noise,
+            times=log.times,
+            odometry=log.odom_poses,
+            ranges=log.ranges,
+            wheel_times=log.odom_stream_times,
+            wheel_poses=log.odom_stream_poses,
+            first=lidar.angle_min,
+            step=lidar.angle_increment,
+            reach=lidar.range_max,
+            noise=lidar.range_std,
         )
 
 
-def read(path: str | PathLike, *, reach: float = math.inf) -> Recording:
+def read(path: str | PathLike, *, range_max: float = math.inf) -> LaserLog:
     """Read a laser log.
 
     Args:
         path: The file.
-        reach: Range [m] from which on a reading counts as no return, unless the file's `reach` is
+        range_max: Range [m] from which on a reading counts as no return, unless the file's `range_max` is
             smaller.
 
     Raises:
@@ -92,20 +92,20 @@ def read(path: str | PathLike, *, reach: float = math.inf) -> Recording:
         ranges.shape[1],
         float(_array(path, arrays, "first", ())),
         _number(path, arrays, "step"),
-        min(_number(path, arrays, "reach"), reach),
-        _number(path, arrays, "noise") if "noise" in arrays else NOISE,
+        min(_number(path, arrays, "reach"), range_max),
+        _number(path, arrays, "noise") if "noise" in arrays else DEFAULT_RANGE_STD,
     )
     wheel_times, wheel_poses = times, odometry
     if "wheel_times" in arrays or "wheel_poses" in arrays:
         wheel_times, wheel_poses = _odometry_stream(path, arrays)
-    return Recording(
+    return LaserLog(
         times=times,
-        odometry=odometry,
-        ranges=no_return(ranges, lidar.reach),
+        odom_poses=odometry,
+        ranges=mark_no_return(ranges, lidar.range_max),
         lidar=lidar,
-        skipped=0,
-        wheel_times=wheel_times,
-        wheel_poses=wheel_poses,
+        num_skipped=0,
+        odom_stream_times=wheel_times,
+        odom_stream_poses=wheel_poses,
     )
 
 

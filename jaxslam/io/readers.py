@@ -7,18 +7,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from jaxslam.io import bags, carmen, g2o, npz
+from jaxslam.core.logs import DEFAULT_RANGE_MAX, LaserLog
+from jaxslam.io import carmen, g2o, npz, ros_bags
 from jaxslam.io.errors import InputError
-from jaxslam.io.recording import REACH, Recording
 from jaxslam.io.text import lines
 
-LOOK = 1000  # lines within which the first of a known format must come
+MAX_LINES_SEARCHED = 1000  # lines within which the first of a known format must come
 
 _KEYWORDS = {b"VERTEX_SE2": g2o, b"EDGE_SE2": g2o, b"VERTEX_XY": g2o}
 _KEYWORDS |= dict.fromkeys((b"FLASER", b"ODOM", b"ROBOTLASER1", b"PARAM", b"RLASER"), carmen)
 
 
-class Known(NamedTuple):
+class NamedLog(NamedTuple):
     """A log that a Python package contains.
 
     Attributes:
@@ -32,23 +32,23 @@ class Known(NamedTuple):
     file: tuple[str, ...]
 
 
-KNOWN = {"killian": Known("rtbdata", "data", ("data", "killian.g2o.zip"))}
+NAMED_LOGS = {"killian": NamedLog("rtbdata", "data", ("data", "killian.g2o.zip"))}
 
 
 def read(
     path: str | PathLike,
     *,
-    reach: float = REACH,
-    scans: str | None = None,
-    odometry: str | None = None,
-) -> Recording:
+    range_max: float = DEFAULT_RANGE_MAX,
+    scan_topic: str | None = None,
+    odometry_topic: str | None = None,
+) -> LaserLog:
     """Read a log: CARMEN log, ROS bag, g2o pose graph with scans, or NumPy file (`npz`).
 
     Args:
-        path: The log, or the name of one of `KNOWN`.
-        reach: Range [m] from which on a reading counts as no return.
-        scans: Topic of the laser scans in a bag.
-        odometry: Topic of the odometry or of the transforms in a bag.
+        path: The log, or the name of one of `NAMED_LOGS`.
+        range_max: Range [m] from which on a reading counts as no return.
+        scan_topic: Topic of the laser scans in a bag.
+        odometry_topic: Topic of the odometry or of the transforms in a bag.
 
     Raises:
         InputError: The format of the log is unknown, topics are named for a log without topics, or
@@ -56,23 +56,25 @@ def read(
     """
     path = find(path)
     reader = reader_of(path)
-    if reader is bags:
-        return bags.read(path, reach=reach, scans=scans, odometry=odometry)
-    if scans is not None or odometry is not None:
+    if reader is ros_bags:
+        return ros_bags.read(
+            path, range_max=range_max, scan_topic=scan_topic, odometry_topic=odometry_topic
+        )
+    if scan_topic is not None or odometry_topic is not None:
         raise InputError("has no topics", path=path, advice="name topics only for ROS bags")
-    return reader.read(path, reach=reach)
+    return reader.read(path, reach=range_max)
 
 
 def find(path: str | PathLike) -> Path:
-    """The path itself, or that of the log of this name in `KNOWN`, unless such a file exists.
+    """The path itself, or that of the log of this name in `NAMED_LOGS`, unless such a file exists.
 
     Raises:
-        InputError: It is the name of a log in `KNOWN`, and the package is not installed.
+        InputError: It is the name of a log in `NAMED_LOGS`, and the package is not installed.
     """
     name = str(path)
-    if Path(path).exists() or name not in KNOWN:
+    if Path(path).exists() or name not in NAMED_LOGS:
         return Path(path)
-    known = KNOWN[name]
+    known = NAMED_LOGS[name]
     spec = find_spec(known.package)
     if spec is None or not spec.submodule_search_locations:
         problem = f"comes with the package {known.package}, which is not installed"
@@ -85,17 +87,17 @@ def reader_of(path: Path) -> ModuleType:
 
     Raises:
         InputError: The file cannot be read, or has no line of a known format among the first
-            `LOOK`.
+            `MAX_LINES_SEARCHED`.
     """
-    if bags.is_bag(path):
-        return bags
+    if ros_bags.is_bag(path):
+        return ros_bags
     if path.is_file() and _is_npz(path):
         return npz
     for number, text in lines(path):
         keyword = text.split(maxsplit=1)[:1]
         if keyword and keyword[0] in _KEYWORDS:
             return _KEYWORDS[keyword[0]]
-        if number >= LOOK:
+        if number >= MAX_LINES_SEARCHED:
             break
     problem = "is a log of no known format"
     advice = "the formats are CARMEN logs, ROS bags, g2o pose graphs with scans, NumPy files"

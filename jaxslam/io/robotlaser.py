@@ -24,29 +24,29 @@ FORM = (
 Name = TypeVar("Name")
 
 
-class Laser(NamedTuple):
+class RobotLaser(NamedTuple):
     """A laser scan.
 
     Attributes:
         line: Number of its line.
         time: [s].
-        first: [rad] angle_min: direction of the first beam.
-        step: [rad] angle_increment: from one beam to the next.
-        reach: [m] range_max.
+        angle_min: [rad] angle_min: direction of the first beam.
+        angle_increment: [rad] angle_increment: from one beam to the next.
+        range_max: [m] range_max.
         ranges: (R,) float64 [m].
         pose: (3,) [m, m, rad] of the laser, by odometry.
     """
 
     line: int
     time: float
-    first: float
-    step: float
-    reach: float
+    angle_min: float
+    angle_increment: float
+    range_max: float
     ranges: np.ndarray
     pose: tuple[float, ...]
 
 
-def parse(line: int, fields: list[bytes]) -> Laser:
+def parse(line: int, fields: list[bytes]) -> RobotLaser:
     """The scan of a line.
 
     Args:
@@ -81,10 +81,10 @@ def parse(line: int, fields: list[bytes]) -> Laser:
     names = ("laser_x", "laser_y", "laser_theta")
     pose = tuple(number(field, name) for field, name in zip(fields[-14:-11], names, strict=True))
     time = number(fields[-3], "time")
-    return Laser(line, time, angle_min, angle_increment, range_max, ranges, pose)
+    return RobotLaser(line, time, angle_min, angle_increment, range_max, ranges, pose)
 
 
-def alike(scans: Mapping[Name, Laser]) -> tuple[dict[Name, Laser], dict[int, str]]:
+def same_scanner(scans: Mapping[Name, RobotLaser]) -> tuple[dict[Name, RobotLaser], dict[int, str]]:
     """Select the scans with the most frequent scanner metadata.
 
     Args:
@@ -96,8 +96,8 @@ def alike(scans: Mapping[Name, Laser]) -> tuple[dict[Name, Laser], dict[int, str
     if not scans:
         return {}, {}
 
-    def metadata(scan: Laser) -> tuple[float, ...]:
-        return scan.first, scan.step, scan.reach, scan.ranges.size
+    def metadata(scan: RobotLaser) -> tuple[float, ...]:
+        return scan.angle_min, scan.angle_increment, scan.range_max, scan.ranges.size
 
     usual = Counter(map(metadata, scans.values())).most_common(1)[0][0]
     others = {scan.line: "another scanner" for scan in scans.values() if metadata(scan) != usual}

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from jaxslam.io.errors import InputError
 
 
-def shown(items: Iterable, path: Path, unit: str, total: int | None = None) -> Iterable:
+def with_progress(items: Iterable, path: Path, unit: str, total: int | None = None) -> Iterable:
     """Iterate over the items of a file with a progress bar.
 
     The bar appears on a terminal only, and after one second.
@@ -60,7 +60,7 @@ def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
             if b"\0" in head:
                 raise InputError("is binary", path=path, advice="name a text file")
             file.seek(0)
-            for count, line in enumerate(shown(file, path, "line"), start=1):
+            for count, line in enumerate(with_progress(file, path, "line"), start=1):
                 yield count, line.removeprefix(b"\xef\xbb\xbf") if count == 1 else line
     except FileNotFoundError:
         raise InputError("does not exist", path=path, advice="check the name") from None

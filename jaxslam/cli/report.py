@@ -1,0 +1,174 @@
+"""Files and figures of a result."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.scan import Scan
+from jaxslam.core.types import JUNCTION
+from jaxslam.evaluation.log_errors import Metrics
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import extract, lidar
+from jaxslam.io import g2o_writer, geojson, graphml, ros_map, tum
+from jaxslam.io.geojson import Arc, Node
+from jaxslam.io.output import write_json
+from jaxslam.mapping import pose_graph
+from jaxslam.mapping.occupancy import occupancy_map
+from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.offline import SlamResult
+from jaxslam.simulation.worlds import World
+from jaxslam.tuning.fitting import TuneResult
+from jaxslam.tuning.parameters import param_names
+
+KINDS = ("node", "corner", "wall")
+MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
+
+
+def write_results(out_dir: Path, numbers: Metrics, times: np.ndarray, result: SlamResult) -> None:
+    """Write metrics.json, trajectory.tum and map.geojson to the folder `out_dir`."""
+    write_json(out_dir / "metrics.json", numbers)
+    tum.write(out_dir / "trajectory.tum", times, result.poses)
+    write_map(out_dir / "map.geojson", result.topological_map)
+
+
+def write_maps(
+    out_dir: Path,
+    config: Config,
+    params: NoiseParams,
+    result: SlamResult,
+    measurements: Measurement,
+    scans: Scan,
+) -> None:
+    """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml."""
+    grid = occupancy_map(config.frontend.lidar, result.poses, scans, resolution=MAP_RESOLUTION)
+    ros_map.write(out_dir / "map.yaml", grid)
+    g2o_writer.write(
+        out_dir / "graph.g2o", pose_graph.build_pose_graph(config, params, result, measurements)
+    )
+    if find_spec("networkx") is not None:
+        graphml.write(out_dir / "map.graphml", result.topological_map)
+
+
+def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
+    """Draw the local Voronoi diagram of scan `number` of [T]."""
+    from jaxslam.viz import (
+        canvas,
+        maps,  # imported here, because matplotlib is slow to import
+    )
+
+    scan = jax.tree.map(lambda leaf: leaf[number], scans)
+    features, diagram, sources = jax.jit(extract.extract_diagram, static_argnums=0)(
+        config.frontend, scan
+    )
+    figure, axes = canvas.canvas(8.0, 4.6)
+    maps.draw_local_diagram(axes[0, 0], diagram, sources, config.frontend.grid, features)
+    axes[0, 0].set_title(f"scan {number}")
+    canvas.legend(figure)
+    figure.savefig(path)
+
+
+def write_map(path: Path, graph: TopologicalMap) -> None:
+    """Write a topological map as GeoJSON."""
+    nodes = []
+    rows = zip(graph.id, graph.xy, graph.kind, graph.clearance, strict=True)
+    for node, (x, y), kind, clearance in rows:
+        clearance = float(clearance) if kind == JUNCTION else np.nan
+        nodes.append(Node(int(node), float(x), float(y), KINDS[kind], clearance))
+    arcs = [
+        Arc(
+            index,
+            int(graph.id[start]),
+            int(graph.id[end]),
+            float(graph.arc_length[index]),
+            float(graph.arc_clearance[index]),
+            graph.arc_lines[index],
+        )
+        for index, (start, end) in enumerate(graph.arc_ends)
+    ]
+    geojson.write(path, nodes, arcs)
+
+
+def draw(
+    out_dir: Path,
+    config: Config,
+    result: SlamResult,
+    lines: dict[str, np.ndarray],
+    error: np.ndarray | None,
+    *,
+    world: World | None = None,
+    scans: Scan | None = None,
+) -> None:
+    """Draw path.png and errors.png.
+
+    Args:
+        out_dir: Folder to write to.
+        config: Configuration of the filter.
+        result: Result of SLAM.
+        lines: Other trajectories (N, 3) by their name in `TRAJECTORY_STYLES`.
+        error: (T, 3) pose errors [m, m, rad], if known.
+        world: World whose walls are drawn.
+        scans: Scans [T] whose end points are drawn.
+    """
+    from jaxslam.viz import (
+        canvas,
+        charts,  # imported here, because matplotlib is slow to import
+        maps,
+    )
+
+    poses = result.poses
+    walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
+    # The odometry of a log may leave the map: it does not set the limits of the axes.
+    limiting = [line for what, line in lines.items() if scans is None or what != "odometry"]
+    figure, axis = canvas.map_canvas(
+        *canvas.extent(poses, result.topological_map.xy, *limiting, *walls)
+    )
+    if world is not None:
+        maps.draw_walls(axis, world)
+    if scans is not None:
+        points = jax.vmap(lidar.beam_ends, in_axes=(0, None))(scans, config.frontend.lidar)
+        maps.draw_hits(axis, poses, np.asarray(points), np.asarray(scans.hit))
+    for what, line in (lines | {"estimate": poses}).items():
+        maps.draw_trajectory(axis, line, what)
+    maps.draw_arcs(axis, result.topological_map)
+    maps.draw_landmarks(axis, result.belief, confirm_count=config.filter.confirm_count)
+    maps.draw_start_and_end(axis, poses)
+    canvas.legend(figure)
+    figure.savefig(out_dir / "path.png")
+
+    figure, axes = canvas.canvas(9.0, 6.0, 3)
+    charts.draw_errors(axes[:, 0], np.asarray(result.info.pose_cov), error)
+    figure.savefig(out_dir / "errors.png")
+
+
+def draw_map(path: Path, occupancy: OccupancyMap, graph: TopologicalMap) -> None:
+    """Draw an occupancy grid with its topological map."""
+    from jaxslam.viz import (
+        canvas,
+        maps,  # imported here, because matplotlib is slow to import
+    )
+
+    figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
+    maps.draw_occupancy(axis, occupancy)
+    maps.draw_topological_map(axis, graph)
+    canvas.legend(figure)
+    figure.savefig(path)
+
+
+def draw_history(path: Path, found: TuneResult) -> None:
+    """Draw losses and parameters over the evaluations of a tuning."""
+    from jaxslam.viz import (
+        canvas,
+        charts,  # imported here, because matplotlib is slow to import
+    )
+
+    figure, axes = canvas.canvas(11.0, 4.0, 1, 2)
+    charts.draw_losses(axes[0, 0], found.loss, found.heldout, found.best)
+    values = [np.asarray(x).reshape(len(found.loss), -1) for x in jax.tree.leaves(found.history)]
+    charts.draw_parameters(
+        axes[0, 1], param_names(found.params), np.concatenate(values, axis=1), found.best
+    )
+    figure.savefig(path)

@@ -1,0 +1,123 @@
+"""The command `jaxslam simulate`."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxslam.cli import report, summaries
+from jaxslam.cli.options import check_range, enable_caches, name_errors, read_params, stopwatch
+from jaxslam.core.devices import use_cpu_devices
+from jaxslam.core.types import JUNCTION
+from jaxslam.evaluation import log_errors, summary
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.io import tum
+from jaxslam.io.output import folder
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.episodes import TrialResult
+from jaxslam.simulation import drives, path_following, trials, worlds
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.worlds import World
+
+
+def simulate(
+    world: str = "office",
+    runs: int = 100,
+    seed: int = 0,
+    noise: Path | None = None,
+    landmarks: Literal["all", "nodes"] = "all",
+    labels: Literal["runs", "codes"] = "runs",
+    out: Path = Path("out"),
+) -> None:
+    """Run SLAM on Monte-Carlo trials: simulated drives of one robot from S to F.
+
+    Writes metrics.json, of all trials, and trajectory.tum, truth.tum, map.geojson, path.png and
+    errors.png of trial 0, whose time stamps are the scan numbers.
+
+    Args:
+        world: World with a path from S to F: office.
+        runs: Number of trials.
+        seed: Random seed of the odometry and range noise.
+        noise: File of the noise parameters of the filter (Q and R); by default those of the
+            simulated robot.
+        landmarks: Landmark types: all, or only the junctions (the paper's nodes).
+        labels: Labels of occupied cells in the Voronoi expansion: straight wall segments (runs),
+            or the paper's edge codes (codes).
+        out: Folder for the results.
+    """
+    use_cpu_devices()
+    check_range("--runs", runs, 1, 10**6)
+    check_range("--seed", seed, 0, 2**32 - 1)
+    with name_errors("--world"):
+        walls = World(jnp.asarray(worlds.named(world).walls, float))
+        path = jnp.asarray(path_following.densify(worlds.waypoints(world)), float)
+    config = Config(
+        frontend=FrontendConfig(
+            labels=labels,
+        ),
+    )
+    config = (
+        config._replace(
+            filter=config.filter._replace(
+                landmark_kinds=(JUNCTION,),
+            ),
+        )
+        if landmarks == "nodes"
+        else config
+    )
+    robot = Robot()
+    noise_params = read_params(noise, NoiseParams.for_simulated_robot(*robot))
+    key = jax.random.key(seed)
+    with folder(out) as out_dir:
+        enable_caches()
+        steps = drives.num_scans_of_drive(robot, path)
+        with stopwatch() as seconds:
+            groups = trials.run_trials(
+                key, config, robot, noise_params, walls, path, num_trials=runs, num_scans=steps
+            )
+            tracks = _collect(groups, runs)
+        numbers = summary.evaluate(tracks) | {
+            "ate_rmse_m": log_errors.mean_ate(tracks),
+            "path_length_m": float(
+                np.mean([log_errors.path_length(poses) for poses in tracks.truth])
+            ),
+            "seconds": seconds,
+        }
+        truth, result = trials.replay_trial(
+            key, config, robot, noise_params, walls, path, trial=0, num_scans=steps
+        )
+        truth, stamps = np.asarray(truth, np.float64), np.arange(steps, dtype=float)
+        report.write_results(out_dir, numbers, stamps, result)
+        tum.write(out_dir / "truth.tum", stamps, truth)
+        trajectories = {"odometry": tracks.dead_reckoning[0], "truth": truth}
+        error = log_errors.pose_errors(result.poses, truth)
+        report.draw(out_dir, config, result, trajectories, error, world=walls)
+    summaries.print_summary(numbers, f"{runs} trials of {steps} scans, world {world}", out)
+
+
+def _collect(groups: Iterable[TrialResult], runs: int) -> TrialResult:
+    """All trials of an experiment, with a progress bar; print the errors of the first group."""
+    done: list[TrialResult] = []
+    errors: list[np.ndarray] = []
+    with tqdm(total=runs, unit="trial", desc="compiling", mininterval=0.5) as bar:
+        for group in groups:
+            done.append(group)
+            errors.append(log_errors.pose_errors(group.estimate, group.truth))
+            rmse = summary.rmse_of(np.concatenate(errors))["position_rmse_m"]
+            if len(done) == 1:
+                odom_error = log_errors.pose_errors(group.dead_reckoning, group.truth)
+                odom_rmse = summary.rmse_of(odom_error)["position_rmse_m"]
+                bar.write(
+                    f"first {len(group.truth)} trials: position RMSE {rmse:.3f} m, "
+                    f"by dead reckoning {odom_rmse:.3f} m"
+                )
+                bar.set_description("running")
+            bar.set_postfix_str(f"position RMSE {rmse:.3f} m", refresh=False)
+            bar.update(len(group.truth))
+    return episodes.concatenate_results(done)

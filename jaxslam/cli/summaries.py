@@ -1,0 +1,110 @@
+"""Printed summaries of results."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxslam.evaluation.log_errors import Metrics
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.tuning.parameters import param_names
+
+SUMMARY_ROWS = (
+    ("position_rmse_m", "position RMSE", "m"),
+    ("heading_rmse_deg", "heading RMSE", "deg"),
+    ("ate_rmse_m", "ATE RMSE", "m"),
+    ("rpe_translation_rmse_m", "RPE translation (delta 1 m)", "m"),
+    ("rpe_rotation_rmse_deg", "RPE rotation (delta 1 m)", "deg"),
+    ("translation_mean_m", "relation error, translation", "m"),
+    ("rotation_mean_deg", "relation error, rotation", "deg"),
+)
+
+
+def print_summary(numbers: Metrics, title: str, out: Path) -> None:
+    """Print a summary of the `metrics.json` of a run or of Monte-Carlo trials."""
+    print(f"\n{title}; path length {numbers['path_length_m']:.0f} m")
+    if numbers.get("skipped_lines"):
+        print(f"{numbers['skipped_lines']} broken lines, or scans without odometry, skipped")
+    for repair in numbers.get("mended", ()):
+        print(f"odometry repairs: {repair}")
+    odometry = numbers.get("dead_reckoning", {})
+    if odometry:
+        print(f"{'':36}{'SLAM':>10}{'odometry':>10}{'ratio':>8}")
+    _print_errors(numbers | numbers.get("relations", {}), odometry | odometry.get("relations", {}))
+    if "diverged" in numbers:
+        print(f"  {'diverged trials':34}{numbers['diverged']:10d}{odometry['diverged']:10d}")
+    if numbers.get("nees") is not None:
+        print(f"  {'NEES per dof (1 if consistent)':34}{numbers['nees']:10.3f}")
+    print(f"  {'landmarks':34}{numbers['landmarks']:10.0f}")
+    print(f"  {'updates per scan':34}{numbers['matches']:10.1f}")
+    if numbers.get("closures"):
+        print(f"  {'loop closures':34}{numbers['closures']:10d}")
+    _print_seconds(numbers)
+    print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")
+
+
+def _print_errors(slam_errors: Metrics, odometry_errors: Metrics) -> None:
+    """Print the `SUMMARY_ROWS` that there are: error of SLAM, of dead reckoning, and their ratio."""
+    for key, name, unit in SUMMARY_ROWS:
+        error = slam_errors.get(key)
+        if error is None:
+            continue
+        line = f"  {f'{name} [{unit}]':34}{error:10.3f}"
+        if key in odometry_errors:
+            ratio = odometry_errors[key] / error if error else np.inf
+            line += f"{odometry_errors[key]:10.3f}{ratio:8.1f}"
+        print(line)
+
+
+def print_map_summary(numbers: Metrics, title: str, out: Path) -> None:
+    """Print a summary of the `metrics.json` of a topological map."""
+    print(f"\n{title}")
+    print(f"  {'nodes, dead ends':34}{numbers['nodes']:10d}{numbers['dead_ends']:10d}")
+    print(f"  {'arcs, independent cycles':34}{numbers['arcs']:10d}{numbers['rings']:10d}")
+    print(f"  {'total arc length [m]':34}{numbers['length_m']:10.1f}")
+    if numbers["arcs"]:
+        print(f"  {'smallest clearance [m]':34}{numbers['narrowest_m']:10.2f}")
+    areas = f"{numbers['reached_m2']:10.1f}{numbers['left_out_m2']:10.1f}"
+    print(f"  {'reachable, omitted area [m^2]':34}{areas}")
+    print(f"  {'run time [s]':34}{numbers['seconds']['run']:10.1f}")
+    print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, map.graphml")
+
+
+def _print_seconds(numbers: Metrics) -> None:
+    seconds = numbers["seconds"]
+    print(f"  {'run time, compile time [s]':34}{seconds['run']:10.1f}{seconds['compile']:10.1f}")
+
+
+def print_tuning_summary(numbers: Metrics, title: str, out: Path) -> None:
+    """Print a summary of the `metrics.json` of a tuning."""
+    before = numbers["before"]
+    print(f"\n{title}; {numbers['evaluations']} evaluations, evaluated on {numbers['judged_on']}")
+    print(f"  {'':34}{'before':>12}{'after':>12}")
+    rows = {"loss": "loss", "position_rmse_m": "position RMSE [m]", "nees": "NEES per dof"}
+    rows |= {"heading_rmse_deg": "heading RMSE [deg]", "diverged": "diverged runs"}
+    for key, name in rows.items():
+        if numbers.get(key) is not None and before.get(key) is not None:
+            print(f"  {name:34}{before[key]:12.4g}{numbers[key]:12.4g}")
+    _print_noise(before["noise"], numbers["noise"], numbers["standard_errors"] or {})
+    for warning in numbers["warnings"]:
+        print(f"warning: {warning}")
+    _print_seconds(numbers)
+    print(f"results: {out}{os.sep}noise.json, metrics.json, history.png")
+
+
+def _print_noise(
+    before: NoiseParams, after: NoiseParams, standard_errors: Mapping[str, float]
+) -> None:
+    """Print the noise parameters before and after a tuning, with relative standard errors."""
+    if standard_errors:
+        print(f"  {'noise parameters (Q and R)':34}{'':24}{'standard error':>18}")
+    old, new = (
+        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(noise)])
+        for noise in (before, after)
+    )
+    for name, old_value, new_value in zip(param_names(after), old, new, strict=True):
+        error = standard_errors.get(name, np.nan)
+        text = "" if np.isnan(error) else "unknown" if np.isinf(error) else f"{error:.0%}"
+        print(f"  {name:34}{old_value:12.4g}{new_value:12.4g}{text:>18}".rstrip())

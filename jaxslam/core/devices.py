@@ -1,0 +1,205 @@
+"""Devices: one CPU device per core, and a map of a function over all devices and processes."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxslam.core import trace_cache
+from jaxslam.core.batching import pad_to
+from jaxslam.core.types import Array
+
+XLA_FLAGS = {  # of XLA
+    "--xla_force_host_platform_device_count": "{cores}",
+    # By default XLA splits operations among the threads of all devices, and these are short.
+    "--xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+}
+
+
+def use_cpu_devices(num_devices: int | None = None) -> None:
+    """Make each CPU core a device of JAX, and let XLA run each operation on one core.
+
+    Call it before JAX does its first work: once JAX has started its backends their devices are
+    fixed, and this does nothing. It does nothing either where `jax_platforms` names another
+    platform than the CPU first. Flags that XLA_FLAGS holds already keep their values.
+
+    Args:
+        num_devices: Number of devices; by default all cores that this process may use.
+    """
+    first_platform = (jax.config.jax_platforms or "cpu").split(",")[0]
+    if first_platform != "cpu" or _backends_started():
+        return
+    count = num_devices or num_cores()
+    present = os.environ.get("XLA_FLAGS", "")
+    flags = [f"{flag}={value.format(cores=count)}" for flag, value in XLA_FLAGS.items()]
+    added = [flag for flag in flags if flag.split("=")[0] not in present]
+    os.environ["XLA_FLAGS"] = " ".join([*present.split(), *added])
+
+
+def _backends_started() -> bool:
+    """Whether JAX has fixed its devices: after that it refuses to change their number.
+
+    JAX has no public function that says so without starting the backends, so a change is tried
+    and undone.
+    """
+    devices = jax.config.jax_num_cpu_devices
+    try:
+        jax.config.update("jax_num_cpu_devices", max(0, devices) + 1)
+    except RuntimeError:
+        return True
+    jax.config.update("jax_num_cpu_devices", devices)
+    return False
+
+
+def num_cores() -> int:
+    """Number of CPU cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+class DeviceMap:
+    """Map a function over any number of items on all devices, `size` of them vectorised at a time.
+
+    Device k of D gets a contiguous block of the items, as `rounds` batches of `size`; the last
+    item is repeated until all batches are full. 19 items, D = 2, size = 4, three rounds:
+
+                    round 0        round 1        round 2
+        device 0    items 0-3      items 4-7      items 8-11
+        device 1    items 12-15    items 16-18,-  -  -  -  -       (-: copy of item 18)
+
+    The host compiles, puts all batches of all devices into their queues without waiting, and
+    returns; results are waited for later:
+
+        host        compile | enqueue |  free for other work   | wait, gather |
+        device 0                 | round 0 | round 1 | round 2 |
+        device 1                 | round 0 | round 1 | round 2 |
+
+    Each device has a compiled program of its own, all from the same trace. So the result of an
+    item depends neither on the other items nor on the number of devices or processes, bit for bit
+    where the devices are alike. (One program for several devices, sharded by XLA, is compiled to
+    other roundings than a program for one.) Only where there are fewer items than D * size are
+    batches smaller, and results may differ by rounding.
+
+    All processes must call it with the same arguments, and all get the whole result.
+    """
+
+    def __init__(self, function: Callable, *, size: int, static: int = 0):
+        """Wrap a function of one item.
+
+        Args:
+            function: Of `static` hashable arguments, one record common to all items, and one item.
+            size: Items of a batch; a single one is not vectorised.
+            static: Number of leading arguments that are static under jit.
+        """
+        self.size = size
+        self._function = function
+        self._static = static
+
+    def __call__(self, *args: Any, devices: Sequence[jax.Device] | None = None) -> Any:
+        """Results of the function, as NumPy arrays that lead with the number of items.
+
+        Args:
+            args: The static arguments, the common record, and the items: arrays that lead with
+                their number.
+            devices: To be used, as many of each process; all by default.
+        """
+        return self.begin(*args, devices=devices)()
+
+    def begin(self, *args: Any, devices: Sequence[jax.Device] | None = None) -> Callable[[], Any]:
+        """Start the work, with the arguments of a call.
+
+        Returns:
+            A function without arguments that waits for the results and returns them.
+        """
+        static, (common, items) = args[: self._static], args[self._static :]
+        mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("items",))
+        count = jax.tree.leaves(items)[0].shape[0]
+        size = min(self.size, -(-count // mesh.size))
+        rounds = -(-count // (size * mesh.size))
+        items = pad_to(items, to=mesh.size * rounds * size)
+
+        def batch_on(device: jax.Device, number: int) -> Any:
+            own = slice(number * size, (number + 1) * size)
+            return jax.device_put(jax.tree.map(lambda x: x[own], items), device)
+
+        # Arguments to the devices of this process; the others serve the rest of the mesh.
+        local = [(k, d) for k, d in enumerate(mesh.devices) if d in mesh.local_devices]
+        common_of = [jax.device_put(common, device) for _, device in local]
+        batches_of = [[batch_on(d, k * rounds + r) for r in range(rounds)] for k, d in local]
+
+        program = self._function, *static
+        _compile(program, common_of, [batches[0] for batches in batches_of])
+        # Dispatch is asynchronous: one batch of every device after the other, so that none idles.
+        results = [
+            [_run(program, *own) for own in zip(common_of, batches, strict=True)]
+            for batches in zip(*batches_of, strict=True)
+        ]
+
+        def finish() -> Any:
+            by_round = [_gather(mesh, parts) for parts in results]
+            ordered = partial(_in_order, devices=mesh.size, size=size)
+            return jax.tree.map(lambda *parts: ordered(parts)[:count], *by_round)
+
+        return finish
+
+
+def _compile(program: tuple, common_of: list[Any], batch_of: list[Any]) -> None:
+    """Compile `_run` for each device, in parallel: XLA does not hold Python's lock.
+
+    Tracing and lowering do, and come first. The programs stay in JAX's cache, where the calls of
+    `_run` find them.
+    """
+    lowered = [
+        _run.trace(program, common, batch).lower()
+        for common, batch in zip(common_of, batch_of, strict=True)
+    ]
+    with ThreadPoolExecutor(min(len(lowered), num_cores())) as pool:
+        list(pool.map(lambda each: each.compile(), lowered))
+
+
+@partial(trace_cache.jit, static_argnames="program")
+def _run(program: tuple, common: Any, items: Any) -> Any:
+    """Results of one batch, arrays that lead with its size; a single item is not vectorised.
+
+    Args:
+        program: The function of a `DeviceMap`, and its static arguments.
+        common: The record common to all items.
+        items: The batch: arrays that lead with its size.
+    """
+    function = partial(*program, common)
+    if jax.tree.leaves(items)[0].shape[0] > 1:
+        return jax.vmap(function)(items)
+    single = function(jax.tree.map(lambda x: x[0], items))
+    return jax.tree.map(lambda x: x[None], single)
+
+
+def _gather(mesh: Mesh, parts: list[Any]) -> Any:
+    """Results of one round of all devices, as NumPy arrays (D * size, ...) on all processes.
+
+    Args:
+        mesh: The D devices.
+        parts: The results (size, ...) of those of this process, in the order of the mesh.
+    """
+
+    def sharded(*shards: Array) -> Array:
+        sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
+        shape = (mesh.size * len(shards[0]), *shards[0].shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, sharding, shards)
+
+    result = jax.tree.map(sharded, *parts)
+    if jax.process_count() > 1:
+        return multihost_utils.process_allgather(result, tiled=True)
+    return jax.tree.map(np.asarray, result)
+
+
+def _in_order(by_round: Sequence[np.ndarray], *, devices: int, size: int) -> np.ndarray:
+    """Join the arrays (D * size, ...) of all rounds in the order of the items: device by device."""
+    split = [x.reshape(devices, size, *x.shape[1:]) for x in by_round]
+    by_device = np.stack(split, axis=1)  # (D, rounds, size, ...)
+    return by_device.reshape(-1, *by_device.shape[3:])

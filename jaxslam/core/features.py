@@ -1,0 +1,67 @@
+"""Features of one scan: the record, its padding, and how records are put together."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.core.types import Array
+
+
+class Features(NamedTuple):
+    """Features of one scan, of all three kinds, padded to M; robot frame.
+
+    Attributes:
+        kind: (M,) int32, `JUNCTION` (a junction), `CORNER` or `WALL`.
+        xy: (M, 2) [m] position; zero for a wall direction.
+        cov: (M, 2, 2) [m^2] covariance of the position.
+        direction: (M,) [rad] of a corner: bisector of its free side; of a wall: of its line, in
+            [-pi/2, pi/2); 0 for a junction.
+        direction_variance: (M,) [rad^2] of a wall's direction.
+        descriptor: (M,) descriptor. Junction: clearance [m]; corner: angle of its free side [rad]; 0 for
+            a wall.
+        degree: (M,) int32 number of walls that the circle of a junction touches.
+        certified: (M,) bool, all of the circle of a junction was seen.
+        trusted: (M,) bool, may start a new landmark; the others are only matched with known ones.
+        valid: (M,) bool, False marks padding.
+    """
+
+    kind: Array
+    xy: Array
+    cov: Array
+    direction: Array
+    direction_variance: Array
+    descriptor: Array
+    degree: Array
+    certified: Array
+    trusted: Array
+    valid: Array
+
+
+def zero_padding(features: Features) -> Features:
+    """Set every number of the padding to zero, except `kind`."""
+    valid = features.valid
+
+    def clear(x: Array) -> Array:
+        return jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
+
+    return jax.tree.map(clear, features)._replace(kind=features.kind)
+
+
+def restrict_features(features: Features, wanted: Array) -> Features:
+    """Blank the features that are not valid, not `wanted` (M,) bool, or hold NaN or infinity."""
+    numbers = (
+        features.xy,
+        features.cov,
+        features.direction,
+        features.direction_variance,
+        features.descriptor,
+    )
+    for x in numbers:
+        wanted &= jnp.all(jnp.isfinite(x.reshape(x.shape[0], -1)), axis=1)
+    return zero_padding(features._replace(valid=features.valid & wanted))
+
+
+def concatenate_features(*parts: Features) -> Features:
+    """Concatenate features of one scan into one record."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)

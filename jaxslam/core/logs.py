@@ -1,0 +1,111 @@
+"""Recorded logs, as the readers return them: laser scans, landmark measurements, relations."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.core.scan import Lidar
+
+DEFAULT_RANGE_STD = 0.02
+"""Standard deviation [m] of a range; logs do not state it."""
+
+DEFAULT_RANGE_MAX = 20.0
+"""Default range_max [m] of an indoor scanner: from here on a reading counts as no return."""
+
+MAX_BROKEN_FRACTION = 0.05
+"""Fraction of a log's lines or scans that may be broken; they are skipped and counted."""
+
+
+class LaserLog(NamedTuple):
+    """A log of T laser scans of R beams with odometry, in file order: times may decrease.
+
+    Poses are by odometry, in the odometry frame (`odom`).
+
+    Attributes:
+        times: (T,) float64 [s] of each scan.
+        odom_poses: (T, 3) float64 [m, m, rad] pose by odometry at each scan.
+        ranges: (T, R) float32 [m]; inf where there is no return.
+        lidar: The scanner.
+        num_skipped: Number of broken lines, or of scans without odometry, left out.
+        odom_stream_times: (N,) float64 [s] of the whole odometry stream.
+        odom_stream_poses: (N, 3) float64 [m, m, rad] of the odometry stream; those of the scans if the
+            log has no separate stream.
+        source: Topics that were read, for messages; "" where there is no choice.
+        odometry_repairs: Odometry repairs: what was wrong with the odometry and has been corrected.
+    """
+
+    times: np.ndarray
+    odom_poses: np.ndarray
+    ranges: np.ndarray
+    lidar: Lidar
+    num_skipped: int
+    odom_stream_times: np.ndarray
+    odom_stream_poses: np.ndarray
+    source: str = ""
+    odometry_repairs: tuple[str, ...] = ()
+
+
+class LandmarkLog(NamedTuple):
+    """A log of landmark measurements: range, bearing and ID, with odometry.
+
+    T steps in order of time, with up to M of the L landmarks each, or none. Measurements of unknown
+    IDs are left out, and so is a second one of a landmark at the same time.
+
+    Attributes:
+        times: (T,) float64 [s].
+        odometry: (T, 3) float64 [m, m, rad] odometry increment since the step before, in the frame
+            of that step; the first is 0.
+        range_bearing: (T, M, 2) float32 range [m] and bearing [rad]; zero for padding.
+        valid: (T, M) bool, False marks padding, which comes last.
+        landmark_index: (T, M) int32 index 0..L-1 of the landmark; -1 for padding.
+        truth: (T, 3) float64 [m, m, rad] reference pose, world frame; zero where there is none.
+        truth_mask: (T,) bool, where there is a reference pose.
+        landmark_positions: (L, 2) float64 [m] reference positions of the landmarks, world frame.
+        landmark_names: (L,) int32 IDs of the landmarks in the log.
+        num_skipped: Number of measurements left out.
+    """
+
+    times: np.ndarray
+    odometry: np.ndarray
+    range_bearing: np.ndarray
+    valid: np.ndarray
+    landmark_index: np.ndarray
+    truth: np.ndarray
+    truth_mask: np.ndarray
+    landmark_positions: np.ndarray
+    landmark_names: np.ndarray
+    num_skipped: int
+
+
+def mark_no_return(ranges: np.ndarray, range_max: float) -> np.ndarray:
+    """Mark readings that are no return.
+
+    Args:
+        ranges: Any shape [m].
+        range_max: range_max [m].
+
+    Returns:
+        The ranges as float32, infinite where they are not above zero or not below `range_max`.
+    """
+    ranges = ranges.copy()
+    ranges[~((ranges > 0.0) & (ranges < np.float32(range_max)))] = np.inf
+    ranges = ranges.astype(np.float32)
+    ranges[ranges >= np.float32(range_max)] = np.inf
+    return ranges
+
+
+class Relations(NamedTuple):
+    """N relative poses between two times of a log.
+
+    Attributes:
+        t1: (N,) [s].
+        t2: (N,) [s].
+        relative_pose: (N, 3) [m, m, rad] pose at t2 in the robot frame at t1.
+
+    References:
+        Kuemmerle et al. (2009), On measuring the accuracy of SLAM algorithms.
+    """
+
+    t1: np.ndarray
+    t2: np.ndarray
+    relative_pose: np.ndarray

@@ -1,0 +1,55 @@
+"""Maps that are handed on: an occupancy map, a topological map."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+MAX_CELLS = 2**26  # most cells of a map
+
+
+class OccupancyMap(NamedTuple):
+    """An occupancy grid of H x W square cells [i, j]; i grows with x, j with y.
+
+    A cell that is neither occupied nor free is unknown.
+
+    Attributes:
+        occupied: (H, W) bool.
+        free: (H, W) bool.
+        resolution: [m] side of a cell.
+        origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
+    """
+
+    occupied: np.ndarray
+    free: np.ndarray
+    resolution: float
+    origin: np.ndarray
+
+
+class TopologicalMap(NamedTuple):
+    """Topological map as a graph: NumPy arrays without padding, map frame.
+
+    Attributes:
+        id: (N,) int landmark ids of the nodes.
+        xy: (N, 2) [m] positions of the nodes.
+        kind: (N,) int `JUNCTION` or `CORNER`; arcs join nodes of kind `JUNCTION` only.
+        clearance: (N,) [m] distance to the nearest obstacle, 0 for a corner.
+        arc_ends: (A, 2) int indices of the two ends of each arc; (i, i) is a loop, and two arcs may
+            have the same pair.
+        arc_length: (A,) [m] length of each arc.
+        arc_clearance: (A,) [m] smallest distance to an obstacle along each arc; NaN for an arc
+            that was driven but not observed.
+        arc_lines: A polylines (n >= 2, 2) [m], from the first end of the arc to the second.
+        frontiers: F polylines (n >= 2, 2) [m], from a node to where the field of view ended.
+        frontier_node: (F,) int index of that node.
+    """
+
+    id: np.ndarray
+    xy: np.ndarray
+    kind: np.ndarray
+    clearance: np.ndarray
+    arc_ends: np.ndarray
+    arc_length: np.ndarray
+    arc_clearance: np.ndarray
+    arc_lines: tuple[np.ndarray, ...]
+    frontiers: tuple[np.ndarray, ...] = ()
+    frontier_node: np.ndarray = np.zeros(0, int)

@@ -1,0 +1,37 @@
+"""What the filter is given at a step: odometry, features, and scan matching if there is any."""
+
+from typing import NamedTuple
+
+from jaxslam.core.features import Features
+from jaxslam.core.types import Array
+
+
+class ScanMatch(NamedTuple):
+    """Result of scan matching: an odometry increment in the frame of the pose before.
+
+    Attributes:
+        increment: (3,) [m, m, rad].
+        information: (3, 3) inverse covariance, from the scan alone; zero in directions that it does
+            not constrain.
+        inlier_fraction: () inlier fraction: part of the points that lie on a surface of the map.
+    """
+
+    increment: Array
+    information: Array
+    inlier_fraction: Array
+
+
+class Measurement(NamedTuple):
+    """Measurements of one step: odometry increment and features.
+
+    Attributes:
+        odometry: (3,) [m, m, rad] odometry since the scan before, frame of the pose before.
+        features: (M) features of this scan, base_link frame.
+        landmark_ids: (M,) int32 known landmark 0..L-1 of each feature, -1 for none; None: associate.
+        scan_match: The same increment by scan matching, to be fused with the odometry, if any.
+    """
+
+    odometry: Array
+    features: Features
+    landmark_ids: Array | None = None
+    scan_match: ScanMatch | None = None

@@ -1,0 +1,89 @@
+"""Angles, SE(2) poses and polar form, in JAX."""
+
+import jax.numpy as jnp
+from jax import lax
+
+from jaxslam.core.types import Array
+
+
+def dead_reckoning(start: Array, odometry: Array) -> Array:
+    """Poses (T, 3) by composing odometry increments (T, 3) from the pose `start` (3,)."""
+
+    def body(pose, increment):
+        pose = compose(pose, increment)
+        return pose, pose
+
+    return lax.scan(body, start, odometry)[1]
+
+
+def wrap_angle(angle: Array) -> Array:
+    """Return the same angle [rad] in [-pi, pi); its derivative is 1 wherever it has one."""
+    return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))
+
+
+def wrap_direction(angle: Array) -> Array:
+    """Return the same direction of an undirected line [rad] in [-pi/2, pi/2)."""
+    return angle - jnp.pi * jnp.floor(angle / jnp.pi + 0.5)
+
+
+def rotation(angle: Array) -> Array:
+    """Matrix (2, 2) that turns vectors counter-clockwise by `angle` [rad]."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
+
+
+def compose(pose: Array, motion: Array) -> Array:
+    """Pose (3,) after `robot` (3,), given in the frame of `pose` (3,): pose (+) motion."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    return jnp.stack(
+        [
+            pose[0] + cos * motion[0] - sin * motion[1],
+            pose[1] + sin * motion[0] + cos * motion[1],
+            wrap_angle(pose[2] + motion[2]),
+        ]
+    )
+
+
+def relative(a: Array, b: Array) -> Array:
+    """Pose `b` (3,) relative to pose `a` (3,), in the frame of `a`: the inverse of `compose`."""
+    cos, sin = jnp.cos(a[2]), jnp.sin(a[2])
+    gap = b[:2] - a[:2]
+    x, y = cos * gap[0] + sin * gap[1], cos * gap[1] - sin * gap[0]
+    return jnp.stack([x, y, wrap_angle(b[2] - a[2])])
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Transform points (..., 2) [m] from the robot frame at `pose` (3,) to the world frame."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    x, y = points[..., 0], points[..., 1]
+    return jnp.stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y], axis=-1)
+
+
+def inverse_transform(pose: Array, points: Array) -> Array:
+    """Transform points (..., 2) [m] from the world frame to the robot frame at `pose` (3,)."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    x, y = points[..., 0] - pose[0], points[..., 1] - pose[1]
+    return jnp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+
+
+def range_bearing(offset: Array) -> Array:
+    """Polar form (2,) [m, rad] of an offset (2,) [m]; its gradient at the origin is 0."""
+    away = jnp.any(offset != 0.0)
+    safe = jnp.where(away, offset, jnp.ones_like(offset))
+    polar = jnp.stack([jnp.hypot(safe[0], safe[1]), jnp.arctan2(safe[1], safe[0])])
+    return jnp.where(away, polar, 0.0)
+
+
+def unit_vector(angle: Array) -> Array:
+    """Unit vector (..., 2) that points along `angle` (...) [rad]."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Third component (...) of the cross product of plane vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Scalar product (...) of plane vectors (..., 2)."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]

@@ -1,0 +1,284 @@
+"""Persistent cache of traced programs: what one process has traced, later ones need not trace.
+
+The first call of a jitted function costs two things:
+
+    Python --trace--> StableHLO --compile--> machine code
+
+JAX's persistent compilation cache (`jax_compilation_cache_dir`) saves the second, but looks machine
+code up by its StableHLO, that is, after tracing. For the filters of this package tracing takes
+longer than reading the machine code. `jit` of this module therefore stores the StableHLO too, in
+the same folder, in the form that `jax.export` serialises.
+
+A call of a function f jitted here:
+
+    if caching is off, or f is called within another trace, or the arguments are on several devices:
+        return jax.jit(f)(arguments)
+    key = folder, JAX settings, static arguments, tree structure, shapes and dtypes
+    if key is not in memory:
+        if the static arguments have a text that means the same in every process:
+            file = folder / "jaxslam-<name of f>-<SHA-256 of sources, JAX version and key>"
+            read the traced program from the file; if that fails, trace f and write the file
+            memory[key] = jax.jit(traced program)
+        else:
+            memory[key] = None
+    if memory[key] is None:
+        return jax.jit(f)(arguments)
+    return memory[key](arguments, committed to their device)
+
+A file is
+
+    bytes 0-31   SHA-256 of the rest
+    bytes 32-    serialised `jax.export.Exported`: StableHLO, platform, trees and shapes of the
+                 arguments and the results
+
+A damaged file fails its checksum and is written again. A file that cannot be written is skipped:
+the process then uses what it has traced. Files are never removed; a change of the package's
+sources gives all of them new names.
+
+Why arguments are committed to a device: JAX compiles a program once for committed arrays (bound to
+a device by `jax.device_put`) and once more for uncommitted ones (all others). Results of an
+exported program are committed, those of a plain `jax.jit` are not. A state that a loop feeds back
+would be uncommitted in the first step and committed in the second, and cost a second compilation.
+With all arguments committed there is one program, and it is the one that `CachedJit.trace(...)`
+compiles ahead of time.
+"""
+
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache, update_wrapper
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any, NamedTuple
+
+import jax
+from jax import export
+from jax.sharding import SingleDeviceSharding
+
+PACKAGE = __name__.split(".")[0]
+SETTINGS = (  # options of JAX that the traced program depends on
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_numpy_dtype_promotion",
+    "jax_threefry_partitionable",
+    "jax_use_shardy_partitioner",
+)
+DIGEST = 32  # bytes of a SHA-256
+
+_enabled = False
+
+
+def enable() -> None:
+    """Turn the cache on for this process; it works where `jax_compilation_cache_dir` is set."""
+    global _enabled
+    _enabled = True
+
+
+class _Key(NamedTuple):
+    """What a traced program depends on, beside the sources of the package and JAX's version.
+
+    Attributes:
+        folder: Folder of the files.
+        settings: Platform of the device, and the values of `SETTINGS`.
+        static: Names and values of the static arguments that were passed.
+        treedef: Structure of the other arguments, by name.
+        avals: Shape, dtype and weak type of each of their leaves.
+    """
+
+    folder: str
+    settings: tuple
+    static: tuple[tuple[str, Any], ...]
+    treedef: jax.tree_util.PyTreeDef
+    avals: tuple[jax.ShapeDtypeStruct, ...]
+
+
+class CachedJit:
+    """A jitted function with a persistent trace; made by `jit`."""
+
+    def __init__(self, function: Callable, static: tuple[str, ...]):
+        """Wrap a function, whose arguments called as in `static` are static."""
+        self._function = function
+        self._static = static
+        self._signature = inspect.signature(function)
+        self._plain = jax.jit(function, static_argnames=static)
+        self._programs: dict[_Key, Callable | None] = {}
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Result of the function."""
+        program, args, kwargs = self._find(args, kwargs)
+        return program(*args, **kwargs)
+
+    def trace(self, *args: Any, **kwargs: Any) -> jax.stages.Traced:
+        """The traced program for such arguments, as `jax.jit(...).trace` returns it.
+
+        Arguments may be `jax.ShapeDtypeStruct`s. Calls use what is compiled from the result.
+        """
+        program, args, kwargs = self._find(args, kwargs)
+        return program.trace(*args, **kwargs)
+
+    def _find(self, args: tuple, kwargs: dict) -> tuple[Callable, tuple, dict]:
+        """Program for such arguments, jitted by JAX, and the arguments to call it with."""
+        fallback = self._plain, args, kwargs
+        folder = jax.config.jax_compilation_cache_dir
+        if not _enabled or folder is None or jax.config.jax_disable_jit:
+            return fallback
+        arguments = self._signature.bind(*args, **kwargs).arguments
+        static = {name: arguments.pop(name) for name in self._static if name in arguments}
+        leaves, treedef = jax.tree.flatten(arguments)
+        device = _common_device(leaves)
+        if device is None:
+            return fallback
+        settings = device.platform, *(getattr(jax.config, name) for name in SETTINGS)
+        key = _Key(folder, settings, tuple(static.items()), treedef, tuple(map(_aval, leaves)))
+        if key not in self._programs:
+            self._programs[key] = self._load_or_trace(key)
+        program = self._programs[key]
+        if program is None:
+            return fallback
+        committed = treedef.unflatten(_commit(leaf, device) for leaf in leaves)
+        return program, (committed,), {}
+
+    def _load_or_trace(self, key: _Key) -> Callable | None:
+        """Program of a key, from its file or newly traced; None if the key has no stable text."""
+        static_text = _stable_text((self._function, key.static))
+        if static_text is None or key.settings[0] != jax.default_backend():  # what export targets
+            return None
+        avals_text = [(aval.shape, aval.dtype, aval.weak_type) for aval in key.avals]
+        text = repr((key.settings, static_text, str(key.treedef), avals_text))
+        digest = hashlib.sha256(f"{version()} {text}".encode()).hexdigest()
+        path = Path(key.folder) / f"{PACKAGE}-{self._function.__name__}-{digest}"
+        _register_records()
+        exported = _read(path)
+        if exported is None:
+            exported = self._export(key)
+            with suppress(OSError):
+                _write(path, exported)
+
+        def program(arrays: dict[str, Any]) -> Any:
+            return exported.call(arrays)
+
+        program.__name__ = self._function.__name__
+        return jax.jit(program)
+
+    def _export(self, key: _Key) -> export.Exported:
+        """Trace the function, as a program of one dictionary: its arguments that are not static."""
+        static = dict(key.static)
+
+        def of_arrays(arrays: dict[str, Any]) -> Any:
+            return self._function(**static, **arrays)
+
+        return export.export(jax.jit(of_arrays))(key.treedef.unflatten(key.avals))
+
+
+def jit(function: Callable, *, static_argnames: str | tuple[str, ...] = ()) -> CachedJit:
+    """`jax.jit` with a trace that outlives the process; see the module's docstring.
+
+    It is plain `jax.jit` within other traced programs (under `jax.vmap`, `jax.grad` or `jax.jit`),
+    and for static arguments without a text that means the same in every process, such as
+    functions of other packages.
+
+    Args:
+        function: A function of this package that depends on nothing but its arguments and the
+            package's sources.
+        static_argnames: Names of its static arguments.
+    """
+    names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
+    return CachedJit(function, tuple(names))
+
+
+def _common_device(leaves: list[Any]) -> jax.Device | None:
+    """Device of the arguments; None where some are being traced, or they are on several."""
+    arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
+    if jax.config.jax_default_device or any(isinstance(x, jax.core.Tracer) for x in arrays):
+        return None
+    devices = {device for x in arrays for device in x.devices()} or {jax.local_devices()[0]}
+    return devices.pop() if len(devices) == 1 else None
+
+
+def _aval(leaf: Any) -> jax.ShapeDtypeStruct:
+    """Shape, dtype and weak type of an argument."""
+    known = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
+    return jax.ShapeDtypeStruct(known.shape, known.dtype, weak_type=known.weak_type)
+
+
+def _commit(leaf: Any, device: jax.Device) -> Any:
+    """An argument, or its shape, bound to a device; a committed array is returned as it is."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=SingleDeviceSharding(device))
+    committed = isinstance(leaf, jax.Array) and leaf.committed
+    return leaf if committed else jax.device_put(leaf, device)
+
+
+def _stable_text(static: Any) -> str | None:
+    """Text of static arguments that means the same in every process; None if there is none.
+
+    Functions and types of this package are written by module and name. Anything else is written
+    by `repr`, and has no stable text if that contains an address (" at 0x...").
+    """
+
+    def qualified(value: Any) -> Any:
+        if not callable(value):
+            return value
+        name = f"{value.__module__}.{getattr(value, '__qualname__', '<')}"
+        importable = "<" not in name and name.split(".")[0] == PACKAGE  # "<": lambda or local
+        return name if importable else value
+
+    text = repr(jax.tree.map(qualified, static))
+    return None if " at 0x" in text else text
+
+
+@cache
+def version() -> str:
+    """Digest (SHA-256, hexadecimal) of this package's sources and of the versions of JAX."""
+    digest = hashlib.sha256(f"{jax.__version__} {jax.lib.__version__}".encode())
+    home = Path(__file__).parent
+    for path in sorted(home.rglob("*.py")):
+        digest.update(str(path.relative_to(home)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+_registered: set[type] = set()
+_registering = Lock()
+
+
+def _register_records() -> None:
+    """Give all NamedTuples of this package a name in `jax.export`, which it serialises them by."""
+    with _registering:
+        for module_name, module in list(sys.modules.items()):
+            if module_name.split(".")[0] != PACKAGE:
+                continue
+            for record in vars(module).values():
+                is_record = isinstance(record, type) and hasattr(record, "_fields")
+                if is_record and record not in _registered:
+                    name = f"{record.__module__}.{record.__qualname__}"
+                    export.register_namedtuple_serialization(record, serialized_name=name)
+                    _registered.add(record)
+
+
+def _read(path: Path) -> export.Exported | None:
+    """The traced program of a file; None if there is no such file or its checksum is wrong."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    digest, serialised = data[:DIGEST], data[DIGEST:]
+    intact = hashlib.sha256(serialised).digest() == digest
+    return export.deserialize(bytearray(serialised)) if intact else None
+
+
+def _write(path: Path, exported: export.Exported) -> None:
+    """Write a traced program to a file, which other processes see whole or not at all.
+
+    It is written in a temporary folder beside its destination and then renamed (atomic).
+    """
+    serialised = bytes(exported.serialize())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=path.parent, prefix=".unfinished-") as folder:
+        temporary = Path(folder) / path.name
+        temporary.write_bytes(hashlib.sha256(serialised).digest() + serialised)
+        temporary.replace(path)

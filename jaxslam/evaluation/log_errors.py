@@ -1,0 +1,101 @@
+"""Errors of the estimated poses of a log, with the keys of `metrics.json`."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core import time_series
+from jaxslam.core.logs import LaserLog, Relations
+from jaxslam.core.se2_np import relative
+from jaxslam.evaluation import consistency, trajectory
+from jaxslam.pipeline.episodes import TrialResult
+
+Metrics = dict[str, Any]
+"""Content of `metrics.json`."""
+
+Trajectory = tuple[np.ndarray, np.ndarray]
+"""Times (N,) [s] and poses (N, 3) [m, m, rad]."""
+
+
+def pose_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Errors (..., 3) [m, m, rad] of poses (..., 3), world frame."""
+    return np.asarray(consistency.pose_error(jnp.asarray(poses, float), jnp.asarray(truth, float)))
+
+
+def path_length(poses: np.ndarray) -> float:
+    """Path length [m] of a trajectory (T, 3)."""
+    return float(np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+
+
+def mean_ate(tracks: TrialResult) -> float | None:
+    """ATE RMSE [m] over Monte-Carlo trials, each aligned on its own; None if none is finite."""
+    stamps = np.arange(tracks.truth.shape[1])
+    squares = [
+        trajectory.ate(stamps, estimate, stamps, truth)["ate_rmse_m"] ** 2
+        for estimate, truth in zip(tracks.estimate, tracks.truth, strict=True)
+        if np.isfinite(estimate).all()
+    ]
+    return float(np.sqrt(np.mean(squares))) if squares else None
+
+
+def against_reference(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> Metrics:
+    """ATE, RPE and heading RMSE of poses (T, 3), after rigid alignment with a reference."""
+    ref_times, ref_poses = known
+    ate = trajectory.ate(times, poses, ref_times, ref_poses)
+    rpe = trajectory.rpe(times, poses, ref_times, ref_poses)
+    i, j = time_series.match_times(times, ref_times).T
+    frame = trajectory.align_trajectory(poses[i, :2], ref_poses[j, :2])
+    turn = relative(relative(frame, ref_poses[j]), poses[i])[:, 2]
+    return ate | rpe | {"heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(turn**2))))}
+
+
+def mean_nees_per_dof(error: np.ndarray, cov: np.ndarray) -> float | None:
+    """Mean NEES per degree of freedom (1 if consistent); None if there is no pose to evaluate.
+
+    Args:
+        error: (T, 3) [m, m, rad]; rows that are not finite are left out.
+        cov: (T, 3, 3); a pose without uncertainty, such as the first, is left out.
+    """
+    use = np.isfinite(error).all(axis=1) & (
+        np.trace(cov, axis1=1, axis2=2) > consistency.CERTAIN_TRACE
+    )
+    nees = np.asarray(
+        consistency.nees(jnp.asarray(error[use], float), jnp.asarray(cov[use], float))
+    )
+    nees = nees[np.isfinite(nees)]
+    return float(nees.mean()) / 3.0 if nees.size else None
+
+
+def against_relations(recording: LaserLog, poses: np.ndarray, verified: Relations) -> Metrics:
+    """Relation errors of poses (T, 3): deviations from verified relative poses."""
+    errors = trajectory.relation_errors(
+        recording.times, poses, recording.odom_stream_times, recording.odom_stream_poses, verified
+    )
+    return {"relations": errors}
+
+
+def errors_against(
+    recording: LaserLog, poses: np.ndarray, known: Trajectory | None, verified: Relations | None
+) -> Metrics:
+    """Evaluate poses (T, 3) with the reference and with the relations, where given."""
+    numbers = {} if known is None else against_reference(recording.times, poses, known)
+    return numbers | ({} if verified is None else against_relations(recording, poses, verified))
+
+
+def reference_in_map(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> np.ndarray:
+    """Reference poses (K, 3) in the map frame, after rigid alignment with poses (T, 3)."""
+    ref_times, ref_poses = known
+    i, j = time_series.match_times(times, ref_times).T
+    return relative(trajectory.align_trajectory(poses[i, :2], ref_poses[j, :2]), ref_poses[j])
+
+
+def errors_since_start(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> np.ndarray:
+    """Errors (T, 3) of poses after alignment at the first matched pose; NaN without reference."""
+    ref_times, ref_poses = known
+    i, j = time_series.match_times(times, ref_times).T
+    origin = np.zeros(3)
+    frame = relative(relative(ref_poses[j[0]], origin), relative(poses[i[0]], origin))
+    error = np.full(poses.shape, np.nan)
+    error[i] = pose_errors(poses[i], relative(frame, ref_poses[j]))
+    return error

@@ -1,0 +1,192 @@
+"""Errors of trajectories against references: ATE, RPE, relations; NumPy, float64."""
+
+import numpy as np
+
+from jaxslam.core.se2_np import compose, relative
+from jaxslam.core.time_series import interpolate_poses, match_times, sort_by_time
+
+
+def align_trajectory(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Rigid transform (3,) [m, m, rad] that best aligns one set of points with another.
+
+    With a_i, b_i the points of the estimate and the reference, each relative to its mean, the
+    rotation that minimises sum_i |b_i - R a_i|^2 has the angle
+
+        atan2(sum_i a_i x b_i, sum_i a_i . b_i)
+
+    Args:
+        estimate: (N, 2) [m].
+        reference: (N, 2) [m], the corresponding points.
+
+    Returns:
+        The pose of the frame of `estimate` in that of `reference`, by least squares.
+
+    Raises:
+        ValueError: The shapes differ, or there is no point.
+
+    References:
+        Umeyama (1991), Least-squares estimation of transformation parameters, without the scale.
+    """
+    estimate, reference = np.asarray(estimate, np.float64), np.asarray(reference, np.float64)
+    if estimate.shape != reference.shape or estimate.ndim != 2 or estimate.size == 0:
+        raise ValueError(f"points {estimate.shape} and {reference.shape} are not both (N >= 1, 2)")
+    estimate_mean, reference_mean = estimate.mean(axis=0), reference.mean(axis=0)
+    a, b = estimate - estimate_mean, reference - reference_mean
+    angle = np.arctan2(
+        np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
+    )
+    rotated_mean = compose(np.array([0.0, 0.0, angle]), np.append(estimate_mean, 0.0))
+    return np.append(reference_mean - rotated_mean[:2], angle)
+
+
+def ate(
+    times: np.ndarray,
+    poses: np.ndarray,
+    ref_times: np.ndarray,
+    ref_poses: np.ndarray,
+    tolerance: float = 0.05,
+) -> dict[str, float | int]:
+    """Absolute trajectory error (ATE) of positions, after rigid alignment.
+
+    Args:
+        times: (N,) [s] of the estimate.
+        poses: (N, 3) [m, m, rad].
+        ref_times: (M,) [s] of the reference, same clock.
+        ref_poses: (M, 3) [m, m, rad], any frame.
+        tolerance: Largest difference [s] of associated times.
+
+    Returns:
+        `ate_rmse_m`, and `matched`: number of poses that were compared.
+
+    Raises:
+        ValueError: Fewer than two times can be associated.
+
+    References:
+        Sturm et al. (2012), A benchmark for the evaluation of RGB-D SLAM systems, section IV.
+    """
+    pairs = match_times(times, ref_times, tolerance)
+    if len(pairs) < 2:
+        raise ValueError(f"{len(pairs)} times agree within {tolerance} s; are the clocks the same?")
+    estimate = np.asarray(poses, np.float64)[pairs[:, 0]]
+    reference = np.asarray(ref_poses, np.float64)[pairs[:, 1], :2]
+    aligned = compose(align_trajectory(estimate[:, :2], reference), estimate)
+    distance = np.linalg.norm(aligned[:, :2] - reference, axis=1)
+    return {"ate_rmse_m": float(np.sqrt(np.mean(distance**2))), "matched": len(pairs)}
+
+
+def rpe(
+    times: np.ndarray,
+    poses: np.ndarray,
+    ref_times: np.ndarray,
+    ref_poses: np.ndarray,
+    tolerance: float = 0.05,
+    delta: float = 1.0,
+) -> dict[str, float | None]:
+    """Relative pose error (RPE) over motions of a fixed length, evo's `delta` in metres.
+
+    The reference is cut into consecutive motions, each as short as possible and `delta` or longer
+    along the reference trajectory; the error of each is the relative pose of the reference's
+    motion and the estimate's.
+
+    Args:
+        times: (N,) [s] of the estimate.
+        poses: (N, 3) [m, m, rad].
+        ref_times: (M,) [s] of the reference, same clock.
+        ref_poses: (M, 3) [m, m, rad], any frame.
+        tolerance: Largest difference [s] of associated times.
+        delta: Length [m] of a motion along the reference trajectory.
+
+    Returns:
+        `rpe_translation_rmse_m` and `rpe_rotation_rmse_deg`; None if the trajectory is shorter.
+
+    Raises:
+        ValueError: `delta` is not positive.
+
+    References:
+        Sturm et al. (2012), A benchmark for the evaluation of RGB-D SLAM systems, section IV.
+    """
+    if not delta > 0.0:
+        raise ValueError(f"motions {delta} m apart")
+    i, j = match_times(times, ref_times, tolerance).T
+    estimate = np.asarray(poses, np.float64)[i]
+    reference = np.asarray(ref_poses, np.float64)[j]
+    ends, length = [0], 0.0
+    for k, distance in enumerate(np.hypot(*np.diff(reference[:, :2], axis=0).T), start=1):
+        length += distance
+        if length >= delta:
+            ends.append(k)
+            length = 0.0
+    if len(ends) < 2:
+        return {"rpe_translation_rmse_m": None, "rpe_rotation_rmse_deg": None}
+    estimated, true = (relative(x[ends[:-1]], x[ends[1:]]) for x in (estimate, reference))
+    error = relative(true, estimated)
+    return {
+        "rpe_translation_rmse_m": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
+        "rpe_rotation_rmse_deg": float(np.degrees(np.sqrt(np.mean(error[:, 2] ** 2)))),
+    }
+
+
+def relation_errors(
+    times: np.ndarray,
+    poses: np.ndarray,
+    odom_times: np.ndarray,
+    odom_poses: np.ndarray,
+    relations: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> dict[str, float | int]:
+    """Relation error: relative poses of a trajectory beside verified ones.
+
+    The pose at a relation's time is the last estimated one, extended by odometry.
+
+    Args:
+        times: (T,) [s] of the estimate, in any order.
+        poses: (T, 3) [m, m, rad].
+        odom_times: (N,) [s] of the odometry, in any order.
+        odom_poses: (N, 3) [m, m, rad] of the odometry, interpolated linearly.
+        relations: Times t1 (K,) and t2 (K,) [s], and the pose (K, 3) at t2 in the frame at t1.
+
+    Returns:
+        `translation_mean_m`, `translation_std_m`, `rotation_mean_deg`, `rotation_std_deg` of the
+        absolute errors, and `used`: number of relations within the time span of the estimate.
+
+    Raises:
+        ValueError: No relation is within that time span.
+
+    References:
+        Kuemmerle et al. (2009), On measuring the accuracy of SLAM algorithms.
+    """
+    t1, t2, verified = (np.asarray(column, np.float64) for column in relations)
+    slack = 1e-5  # [s] for the rounding of written times
+    first = np.min(times) - slack
+    last = max(np.max(times), np.max(odom_times)) + slack
+    used = (np.minimum(t1, t2) >= first) & (np.maximum(t1, t2) <= last)
+    if not used.any():
+        raise ValueError(f"no relation lies within the trajectory's times {first} to {last} s")
+    start, end = (_pose_at(t[used], slack, times, poses, odom_times, odom_poses) for t in (t1, t2))
+    error = relative(verified[used], relative(start, end))
+    translation = np.hypot(error[:, 0], error[:, 1])
+    rotation = np.degrees(np.abs(error[:, 2]))
+    return {
+        "translation_mean_m": float(translation.mean()),
+        "translation_std_m": float(translation.std()),
+        "rotation_mean_deg": float(rotation.mean()),
+        "rotation_std_deg": float(rotation.std()),
+        "used": int(used.sum()),
+    }
+
+
+def _pose_at(
+    wanted: np.ndarray,
+    slack: float,
+    times: np.ndarray,
+    poses: np.ndarray,
+    odometry_times: np.ndarray,
+    odometry_poses: np.ndarray,
+) -> np.ndarray:
+    """Poses (K, 3) at times (K,) [s]: the last estimate before each, extended by odometry."""
+    times, poses = sort_by_time(times, poses)
+    last = np.searchsorted(times, wanted + slack, side="right") - 1
+    odometry = sort_by_time(odometry_times, odometry_poses)
+    increment = relative(
+        interpolate_poses(times[last], *odometry), interpolate_poses(wanted, *odometry)
+    )
+    return compose(poses[last], increment)

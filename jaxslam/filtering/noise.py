@@ -1,0 +1,123 @@
+"""Noise parameters of the filter: process noise Q of odometry, measurement noise R of features."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.core.features import Features
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.types import WALL, Array
+from jaxslam.filtering import measurement_model
+from jaxslam.filtering.motion_model import odometry_cov, wheel_coefficients
+from jaxslam.matching import scan_matching
+
+
+class NoiseParams(NamedTuple):
+    """Standard deviations that the filter assumes; traced, so that gradients can tune them.
+
+    Every field is a standard deviation or a factor on one, never a variance.
+
+    Attributes:
+        odometry_coefficients: (4,) coefficients of Q in `motion_model.odometry_cov`, standard deviations that grow
+            with the root of what was driven: distance per distance [m / sqrt(m)], distance per
+            rotation [m / sqrt(rad)], heading per distance [rad / sqrt(m)], heading per rotation
+            [rad / sqrt(rad)].
+        range_std: () [m] of a point feature's range, added (as a variance) to the feature's own
+            covariance from the front end.
+        bearing_std: () [rad] of a point feature's bearing, added likewise.
+        feature_std_scale: () [-] factor on the front end's own standard deviation of a feature.
+        wall_angle_std: () [rad] of a wall's direction, added likewise to the wall's own variance.
+        scan_match_std_scale: () [-] factor on the standard deviation of scan-matched odometry; None where no
+            scans are matched.
+    """
+
+    odometry_coefficients: Array
+    range_std: Array
+    bearing_std: Array
+    feature_std_scale: Array
+    wall_angle_std: Array
+    scan_match_std_scale: Array | None = None
+
+    @classmethod
+    def for_simulated_robot(
+        cls, wheel_base: float = 0.4, encoder_noise: float = 0.005
+    ) -> "NoiseParams":
+        """Noise of a simulated robot: its encoders, and the errors of the front end on its scans.
+
+        Args:
+            wheel_base: [m] between the wheels.
+            encoder_noise: [m / sqrt(m)] standard deviation of an encoder.
+        """
+        return cls(
+            wheel_coefficients(wheel_base, encoder_noise), 0.002, 0.001, 0.85, 0.0001
+        ).as_arrays()
+
+    @classmethod
+    def for_laser_log(cls, *, match_scans: bool = False) -> "NoiseParams":
+        """Noise for recorded laser logs of unknown robots: conservative.
+
+        Args:
+            match_scans: Whether odometry is fused with scan matching. Odometry is then trusted
+                less: where the robot slips, it must not bias the heading that the scans determine.
+        """
+        if match_scans:
+            return cls([0.1, 0.1, 0.2, 0.4], 0.05, 0.01, 1.5, 0.03, 0.3).as_arrays()
+        return cls([0.05, 0.05, 0.05, 0.05], 0.05, 0.01, 1.5, 0.03).as_arrays()
+
+    @classmethod
+    def for_landmark_sensor(cls) -> "NoiseParams":
+        """Hand-set noise for a small robot that measures range and bearing of known landmarks."""
+        return cls([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03).as_arrays()
+
+    def as_arrays(self) -> "NoiseParams":
+        """The same numbers as arrays of JAX's default float type."""
+        return NoiseParams(*(x if x is None else jnp.asarray(x, float) for x in self))
+
+
+def measurement_cov(
+    params: NoiseParams, features: Features, *, untrusted_inflation: float = 1.0
+) -> Array:
+    """Measurement covariance R (M, 2, 2) of the features of a scan.
+
+        point:  R = k^2 (f^2 J C J^T + diag(s_range, s_bearing)^2)     [m, rad]
+        wall:   R = diag(f^2 v + s_wall^2, 1)                          [rad, -]
+
+    C is the front end's covariance of the position, J the Jacobian of range and bearing, v the
+    front end's variance of a wall's direction, f the factor `params.scale`, and s_ the standard
+    deviations in `params`. k is 1 for a trusted point and `untrusted_inflation` for another. The second number of
+    a wall's measurement is always 0; its variance 1 is a placeholder.
+
+    Args:
+        params: Noise parameters.
+        features: Features of a scan.
+        untrusted_inflation: Inflation factor on the standard deviation of points that are not trusted.
+    """
+    own = jax.vmap(measurement_model.polar_cov)(features.xy, features.cov)
+    added = jnp.diag(jnp.stack([params.range_std, params.bearing_std]) ** 2)
+    inflation = jnp.where(features.trusted, 1.0, untrusted_inflation**2).astype(own.dtype)
+    point = (params.feature_std_scale**2 * own + added[None]) * inflation[:, None, None]
+    angle = params.feature_std_scale**2 * features.direction_variance + params.wall_angle_std**2
+    zero = jnp.zeros_like(angle)
+    wall = jnp.stack([jnp.stack([angle, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
+    return jnp.where((features.kind == WALL)[:, None, None], wall, point)
+
+
+def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Array, Array]:
+    """Odometry increment of a step, fused with scan matching where there is any.
+
+    Returns:
+        The increment (3,) [m, m, rad] since the step before, in the frame of that pose, and its
+        covariance (3, 3).
+
+    Raises:
+        ValueError: There is scan matching, and `params.alignment` is None; while tracing.
+    """
+    motion_cov = odometry_cov(params.odometry_coefficients, measurement.odometry)
+    if measurement.scan_match is None:
+        return measurement.odometry, motion_cov
+    if params.scan_match_std_scale is None:
+        raise ValueError("noise.alignment is None, but odometry by scan matching is given")
+    return scan_matching.fuse_odometry(
+        measurement.odometry, motion_cov, measurement.scan_match, params.scan_match_std_scale
+    )

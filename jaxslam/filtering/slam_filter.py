@@ -1,0 +1,287 @@
+"""One step of the EKF-SLAM filter, and the filter over an episode."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxslam.core.features import Features, restrict_features
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.types import WALL, Array
+from jaxslam.filtering import ekf
+from jaxslam.filtering.belief import Belief
+from jaxslam.filtering.config import FilterConfig, required_observations
+from jaxslam.filtering.data_association import Association, associate, use_known_ids
+from jaxslam.filtering.joint_covariance import LinearizedMeasurements, mask_measurements
+from jaxslam.filtering.kalman import UpdateResult, innovation_cov, log_likelihood
+from jaxslam.filtering.match_verification import verify_matches
+from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
+from jaxslam.filtering.track_management import add_landmarks, manage_tracks
+
+
+class StepInfo(NamedTuple):
+    """Diagnostics of one step; the next step does not depend on them.
+
+    Attributes:
+        pose: (3,) [m, m, rad] estimated, map frame.
+        pose_cov: (3, 3) its covariance.
+        slot: (M,) int32 slot of each feature's landmark, matched or new; L for none.
+        id: (M,) int32 id of that landmark, -1 for none.
+        used: (M,) bool, the feature updated the state.
+        nis: () normalised innovation squared, of all used features together.
+        dof: () int32 its degrees of freedom.
+        log_likelihood: () [nats] of the innovations.
+        finite: () bool, False where the update was not finite and was left out.
+        num_new: () int32 number of new landmarks.
+        num_pruned: () int32 number of landmarks that were pruned, unconfirmed ones included.
+        num_evicted: () int32 number of unconfirmed landmarks that were evicted from a full map.
+        num_merged: () int32 number of duplicates that were merged.
+    """
+
+    pose: Array
+    pose_cov: Array
+    slot: Array
+    id: Array
+    used: Array
+    nis: Array
+    dof: Array
+    log_likelihood: Array
+    finite: Array
+    num_new: Array
+    num_pruned: Array
+    num_evicted: Array
+    num_merged: Array
+
+
+class _Matches(NamedTuple):
+    """Matches of the features of a scan, as `step` narrows them down.
+
+    Attributes:
+        slot: (M,) int32 slot of the matched landmark, L for none.
+        used: (M,) bool, the match updates the state; a match with an unconfirmed landmark does not.
+        order: (K,) int32 feature of each of the K rows of the update.
+    """
+
+    slot: Array
+    used: Array
+    order: Array
+
+
+def step(
+    config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
+) -> tuple[Belief, StepInfo]:
+    """One step of EKF-SLAM.
+
+        select     the features of the configured kinds; their covariance R
+        predict    the belief by the odometry increment
+        associate  features with landmarks of the predicted belief
+        choose     the matches that update the state: confirmed landmarks, walls first
+        linearise  their innovations
+        verify     them jointly, and drop the rejected ones
+        update     the belief; leave the update out if it is not finite
+        manage     the tracks: record observations, prune landmarks, merge duplicates
+        add        new landmarks, evicting unconfirmed ones from a full map
+
+    With `measurement.known` correspondences are given: nothing is associated, verified, pruned or
+    merged, and a landmark is confirmed by its first observation. No more than `config.matches`
+    features update the state in a step, and no more than `config.fresh` become landmarks.
+
+    Correspondences are integers: derivatives are those of the filter with correspondences fixed.
+
+    Args:
+        config: Static configuration.
+        params: Standard deviations of odometry and features.
+        belief: Belief after the step before.
+        measurement: Odometry increment and features of this step.
+
+    Raises:
+        ValueError: `measurement.known` has another shape or type than the features, or there is scan
+            matching and `params.alignment` is None; while tracing.
+
+    References:
+        Paper, section 3, eqs. (1)-(16). Thrun, Burgard, Fox (2005), Probabilistic Robotics,
+        chapter 10.
+    """
+    is_known = measurement.landmark_ids is not None
+    if is_known:
+        config = config._replace(
+            filter=config._replace(
+                confirm_count=1,
+                wall_confirm_count=1,
+            ),
+        )
+    features, features_cov = _select(config, params, measurement.features)
+    predicted = _predict(config, params, belief, measurement)
+    found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
+    matches = _choose(config, predicted, features, found.slot)
+    chosen, rows = _linearise(config, predicted, features, features_cov, matches)
+    if not is_known:
+        predicted, rows, matches = _verify(config, predicted, chosen, rows, matches)
+    updated, result, matches = _update(config, predicted, rows, matches)
+    tracked, pruned, merged = manage_tracks(config, updated, features, matches, is_known)
+    found = found._replace(is_new=found.is_new & result.ok)
+    mapped, new_slot, evicted = add_landmarks(config, tracked, features, features_cov, found)
+    info = _step_info(
+        mapped, features, matches, new_slot, result, pruned=pruned, merged=merged, evicted=evicted
+    )
+    return mapped, info
+
+
+def _select(config: FilterConfig, noise: NoiseParams, features: Features) -> tuple[Features, Array]:
+    """Features of the configured kinds, and their measurement covariance R (M, 2, 2)."""
+    allowed = jnp.isin(features.kind, jnp.array(config.landmark_kinds, jnp.int32))
+    features = restrict_features(features, allowed)
+    return features, measurement_cov(
+        noise, features, untrusted_inflation=config.untrusted_inflation
+    )
+
+
+def _predict(
+    config: FilterConfig, noise: NoiseParams, belief: Belief, inputs: Measurement
+) -> Belief:
+    """Predict by the odometry increment, and count the step."""
+    motion, motion_cov = motion_estimate(noise, inputs)
+    belief = ekf.predict(belief, motion, motion_cov, linearisation=config.linearisation)
+    return belief._replace(step=belief.step + 1)
+
+
+def _associate(
+    config: FilterConfig,
+    belief: Belief,
+    features: Features,
+    features_cov: Array,
+    known: Array | None,
+) -> Association:
+    """Associate features with landmarks, by known ids where they are given."""
+    if known is not None:
+        return use_known_ids(belief, features, known)
+    return associate(config.association, belief, features, features_cov)
+
+
+def _choose(config: FilterConfig, belief: Belief, features: Features, slot: Array) -> _Matches:
+    """Choose the matches that update the state, no more than `config.matches`.
+
+    Only landmarks that this observation confirms, or that are confirmed already, are used. Wall
+    directions come first, then the order of the front end.
+    """
+    size = belief.num_seen.size
+    observations = belief.num_seen.at[slot].get(mode="fill", fill_value=0) + 1
+    used = (slot < size) & (observations >= required_observations(config, features.kind))
+    priority = jnp.where(used, jnp.where(features.kind == WALL, 2, 1), 0)
+    order = jnp.argsort(-priority, stable=True)[: config.max_updates]
+    used &= jnp.zeros_like(used).at[order].set(True)
+    return _Matches(slot, used, order)
+
+
+def _linearise(
+    config: FilterConfig, belief: Belief, features: Features, features_cov: Array, matches: _Matches
+) -> tuple[Features, LinearizedMeasurements]:
+    """Features (K) of the rows of the update, and their innovations with Jacobians."""
+    used_slot = jnp.where(matches.used, matches.slot, belief.num_seen.size)
+    chosen, chosen_cov, chosen_slot = jax.tree.map(
+        lambda field: field[matches.order], (features, features_cov, used_slot)
+    )
+    rows = ekf.linearize(
+        belief, chosen, chosen_cov, chosen_slot, linearisation=config.linearisation
+    )
+    return chosen, rows
+
+
+def _verify(
+    config: FilterConfig,
+    belief: Belief,
+    chosen: Features,
+    rows: LinearizedMeasurements,
+    matches: _Matches,
+) -> tuple[Belief, LinearizedMeasurements, _Matches]:
+    """Drop the matches that `verify_matches` rejects.
+
+    Returns:
+        The belief with its counts of matches not yet accepted, the rows and the matches that are
+        left. A rejected match does not count as an observation of its landmark, either.
+    """
+    joint_cov = lax.stop_gradient(innovation_cov(ekf.covariance_blocks(belief), rows))
+    accepted, looks = verify_matches(config.association, belief, chosen, rows, joint_cov)
+    rows, belief = mask_measurements(rows, accepted), belief._replace(num_pending=looks)
+    slot, used, order = matches
+    rejected = used & jnp.zeros_like(used).at[order].set(~accepted)
+    slot = jnp.where(rejected, belief.num_seen.size, slot)
+    return belief, rows, _Matches(slot, used & ~rejected, order)
+
+
+def _update(
+    config: FilterConfig, belief: Belief, rows: LinearizedMeasurements, matches: _Matches
+) -> tuple[Belief, UpdateResult, _Matches]:
+    """Update by all rows at once, unless the result is not finite.
+
+    Returns:
+        The belief, the result of the update, and the matches. Where the updated mean is not finite,
+        `result.good` is False and no match is left. An update that fails changes no covariance, so
+        only the mean is restored.
+    """
+    updated, result = ekf.update(belief, rows, linearisation=config.linearisation)
+    finite = jnp.all(jnp.isfinite(updated.mean)) & result.ok
+    updated = updated._replace(mean=jnp.where(finite, updated.mean, belief.mean))
+    slot = jnp.where(finite, matches.slot, belief.num_seen.size)
+    matches = matches._replace(slot=slot, used=matches.used & finite)
+    return updated, result._replace(ok=finite), matches
+
+
+def _step_info(
+    belief: Belief,
+    features: Features,
+    matches: _Matches,
+    new_slot: Array,
+    result: UpdateResult,
+    *,
+    pruned: Array,
+    merged: Array,
+    evicted: Array,
+) -> StepInfo:
+    """Diagnostics of the step; the likelihood of an update that was left out is zero."""
+    size = belief.num_seen.size
+    slot = jnp.minimum(matches.slot, new_slot)
+    degrees = jnp.where(features.kind == WALL, 1, 2)
+    dof = jnp.sum(jnp.where(matches.used, degrees, 0), dtype=jnp.int32)
+    return StepInfo(
+        pose=belief.pose,
+        pose_cov=belief.pose_cov,
+        slot=slot,
+        id=belief.id.at[slot].get(mode="fill", fill_value=-1),
+        used=matches.used,
+        nis=jnp.where(result.ok, result.nis, 0.0),
+        dof=dof,
+        log_likelihood=jnp.where(result.ok, log_likelihood(result, dof), 0.0),
+        finite=result.ok,
+        num_new=jnp.sum(new_slot < size, dtype=jnp.int32),
+        num_pruned=pruned,
+        num_evicted=evicted,
+        num_merged=merged,
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def run_filter(
+    config: FilterConfig, params: NoiseParams, belief: Belief, measurements: Measurement
+) -> tuple[Belief, StepInfo]:
+    """Run the filter over one log.
+
+    For a derivative, only the rows of the covariance that each step touched are kept, never the
+    whole. Derivatives are taken in reverse mode only (`kalman.kalman_update`).
+
+    Args:
+        config: Static configuration.
+        params: Standard deviations of odometry and features.
+        belief: Belief before the first step.
+        measurements: [T] measurements.
+
+    Returns:
+        The belief after the last step, and the diagnostics [T].
+    """
+
+    def body(belief: Belief, now: Measurement) -> tuple[Belief, StepInfo]:
+        return step(config, params, belief, now)
+
+    return lax.scan(body, belief, measurements)

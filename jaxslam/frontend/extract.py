@@ -1,0 +1,92 @@
+"""The front end as a whole: from a scan to features, and to the local topological map."""
+
+from functools import partial
+
+import jax.numpy as jnp
+
+from jaxslam.core import trace_cache
+from jaxslam.core.batching import map_batches
+from jaxslam.core.features import Features, concatenate_features
+from jaxslam.core.scan import Scan
+from jaxslam.core.types import Array
+from jaxslam.frontend import automaton, edge_codes, junctions, local_graph, segmentation, voronoi
+from jaxslam.frontend.automaton import Diagram
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.features import find_corners, find_wall_directions
+from jaxslam.frontend.grid import rasterise, seen_free
+from jaxslam.frontend.local_graph import LocalArcs
+from jaxslam.frontend.segments import segment_cells
+
+SCAN_BATCH = 16  # scans whose features are extracted together
+
+
+def extract_features(config: FrontendConfig, scan: Scan) -> Features:
+    """Extract the features of one scan, base_link frame."""
+    return extract_diagram(config, scan)[0]
+
+
+def segment_fronts(run: Array, open: Array) -> Array:
+    """Initial cells (H, W) int8 of the automaton, as `automaton.expand_fronts` takes them.
+
+    Args:
+        run: (H, W) int8 wall segment of each source cell, -1 elsewhere.
+        open: (H, W) bool, cells that fronts may enter.
+    """
+    empty = jnp.where(open, automaton.EMPTY, automaton.SHUT).astype(jnp.int8)
+    return jnp.where(run >= 0, run, empty)
+
+
+def extract_diagram(config: FrontendConfig, scan: Scan) -> tuple[Features, Diagram, Array]:
+    """Extract the features of one scan.
+
+    Returns:
+        The features (base_link frame), the Voronoi diagram that the junctions come from, and its
+        source cells (H, W) bool.
+
+    References:
+        Paper, section 2; `labels="codes"` is its method, with fronts that are diamonds.
+    """
+    lidar, spec = config.lidar, config.grid
+    segments = segmentation.find_segments(lidar, config.segments, scan)
+    if config.labels == "codes":
+        grid = rasterise(lidar, spec, scan)
+        labels = edge_codes.edge_code_bits(edge_codes.edge_codes(spec, grid))
+        start = automaton.initial_fronts(labels, grid.free)
+        sources = grid.occupied
+    else:
+        segment = segment_cells(lidar, spec, scan, segments)
+        sources = segment >= 0
+        bit = jnp.uint32(1) << jnp.maximum(segment, 0).astype(jnp.uint32)
+        labels = jnp.where(sources, bit, 0)
+        start = segment_fronts(segment, seen_free(lidar, spec, scan))
+    octagon = config.labels == "segments"
+    fronts = automaton.expand_fronts(start, steps=config.automaton_steps, octagon=octagon)
+    diagram = automaton.diagram_of_fronts(labels, fronts, octagon=octagon)
+    cells = voronoi.junction_cells_of_fronts(fronts, sources)
+    features = concatenate_features(
+        junctions.find_junctions(lidar, spec, config.features, cells, scan, segments),
+        find_corners(config.features, segments),
+        find_wall_directions(config.features, segments),
+    )
+    return features, diagram, sources
+
+
+def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, LocalArcs]:
+    """Local topological map of one scan: its features, and the arcs between its junctions."""
+    features, diagram, sources = extract_diagram(config, scan)
+    arcs = local_graph.find_local_arcs(
+        config.lidar,
+        config.grid,
+        config.features,
+        features,
+        diagram,
+        sources,
+        scan,
+    )
+    return features, arcs
+
+
+@partial(trace_cache.jit, static_argnames="config")
+def extract_local_graphs(config: FrontendConfig, scans: Scan) -> tuple[Features, LocalArcs]:
+    """`extract_local_graph` of scans [T], `SCAN_BATCH` at a time to bound memory."""
+    return map_batches(partial(extract_local_graph, config), scans, batch_size=SCAN_BATCH)

@@ -1,0 +1,55 @@
+"""Geometry of a laser scan: directions and end points of the beams, what they see to be free."""
+
+import jax.numpy as jnp
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import unit_vector
+from jaxslam.core.types import Array, check_array
+
+
+def beam_angles(lidar: Lidar) -> Array:
+    """Angles (R,) [rad] of the beams in the robot frame."""
+    return lidar.angle_min + lidar.angle_increment * jnp.arange(lidar.num_beams, dtype=float)
+
+
+def beam_ends(lidar: Lidar, scan: Scan) -> Array:
+    """Ends (R, 2) [m] of the beams in the robot frame.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    check_array("scan.ranges", scan.ranges, (lidar.num_beams,), jnp.floating)
+    return scan.ranges[:, None] * unit_vector(beam_angles(lidar))
+
+
+def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
+    """Whether points lie before the ends of the two beams on either side: in the visible region.
+
+    Args:
+        points: (..., 2) [m] points, robot frame.
+        ranges: (R,) [m] of the beams.
+        lidar: The scanner; points outside its field of view are not visible.
+
+    Returns:
+        (...) bool.
+    """
+    beam = (jnp.arctan2(points[..., 1], points[..., 0]) - lidar.angle_min) / lidar.angle_increment
+    low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.num_beams - 2)
+    within = (beam > -0.5) & (beam < lidar.num_beams - 0.5)
+    return within & (jnp.linalg.norm(points, axis=-1) < jnp.minimum(ranges[low], ranges[low + 1]))
+
+
+def to_scan(lidar: Lidar, ranges: Array) -> Scan:
+    """Scans of raw ranges (..., R) [m]; NaN, infinite or beyond the largest range is no return.
+
+    Raises:
+        ValueError: The ranges are not those of this lidar's beams; while tracing.
+    """
+    check_array("ranges", ranges, (..., lidar.num_beams), jnp.floating)
+    hit = (ranges > 0.0) & (ranges < lidar.range_max)  # NaN compares false
+    return Scan(ranges=jnp.where(hit, ranges, lidar.range_max), hit=hit)
+
+
+def field_of_view(lidar: Lidar) -> tuple[float, float]:
+    """Directions [rad] of the first and the last beam, robot frame."""
+    return lidar.angle_min, lidar.angle_min + lidar.angle_increment * (lidar.num_beams - 1)

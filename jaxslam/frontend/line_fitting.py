@@ -1,0 +1,295 @@
+"""Straight pieces of a laser scan: optimal partitioning of its beams, and moments of line fits."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import dot, unit_vector
+from jaxslam.core.types import Array
+from jaxslam.frontend.lidar import beam_angles
+
+NO_BEAM = np.iinfo(np.int32).max  # first beam of padding
+
+
+class BeamIntervals(NamedTuple):
+    """Intervals of successive beams, padded to K; padding holds no beam.
+
+    Attributes:
+        first: (K,) int32 first beam; of padding a number past all beams.
+        last: (K,) int32 last beam; -1 of padding.
+    """
+
+    first: Array
+    last: Array
+
+    @property
+    def size(self) -> Array:
+        """Number (K,) int32 of their beams."""
+        return jnp.maximum(self.last - self.first + 1, 0)
+
+    def interval_of_beam(self, beams: int) -> Array:
+        """Index (R,) int32 of the interval that each beam is in, K for none."""
+        beam = jnp.arange(beams, dtype=jnp.int32)[None]
+        slot = jnp.arange(self.first.size, dtype=jnp.int32)[:, None]
+        member = (self.first[:, None] <= beam) & (beam <= self.last[:, None])
+        return jnp.min(jnp.where(member, slot, self.first.size), axis=0)
+
+
+class Moments(NamedTuple):
+    """Weighted moments of points, from which K lines follow.
+
+    Attributes:
+        weight: (K,) sum of the weights.
+        mean: (K, 2) [m] weighted mean.
+        scatter: (K, 3) weighted sums of xx, xy, yy about the mean, [m^2] times the weight's unit.
+    """
+
+    weight: Array
+    mean: Array
+    scatter: Array
+
+
+class LineCandidates(NamedTuple):
+    """Candidates for the last segment up to the present beam, with their lines; leading axis C.
+
+    Each lane is one choice of the segment's first beam. Its line is 1 / r = a cos(t) + b sin(t),
+    where t is the bearing from that first beam; see `partition_beams`.
+
+    Attributes:
+        cost: (C,) of the best partition up to the present beam that ends in this segment.
+        first: (C,) int32 first beam of the segment.
+        heading: Two of (C,), cosine and sine of the bearing of the first beam, robot frame.
+        line: Two of (C,), a and b [1/m].
+        cov: Three of (C,), covariance of a and b: aa, ab, bb [1/m^2].
+    """
+
+    cost: Array
+    first: Array
+    heading: tuple[Array, Array]
+    line: tuple[Array, Array]
+    cov: tuple[Array, Array, Array]
+
+
+class Partition(NamedTuple):
+    """Partition of the beams of a scan into segments.
+
+    Attributes:
+        begins: (R,) bool, a segment begins at this beam.
+        normal: (R, 2) unit normal, away from the robot, of the line fitted up to this beam.
+    """
+
+    begins: Array
+    normal: Array
+
+
+def partition_beams(
+    lidar: Lidar,
+    scan: Scan,
+    breaks: Array,
+    range_std: float,
+    *,
+    segment_cost: float,
+    outlier_cost: float,
+    num_candidates: int,
+    roughness_std: float,
+    roughness_length: float,
+    max_incidence: float = 10.0,
+) -> Partition:
+    """Partition a scan into straight segments, at the least cost.
+
+    Line. A wall at the distance d, with its normal at the bearing p, is r cos(bearing - p) = d:
+
+        1 / r = a cos(t) + b sin(t),    a = cos(p - p0) / d,    b = sin(p - p0) / d
+
+    with t = bearing - p0, and p0 the bearing of the segment's first beam. So q = 1 / r is linear in
+    (a, b). There sqrt(a^2 + b^2) = 1 / d is the inverse distance of the foot of the perpendicular,
+    and b / a the tangent of the angle of incidence at t = 0. The prior is a = q with its variance,
+    and b = 0 with the standard deviation `max_incidence` * q.
+
+    Fit. Each beam is one step of recursive least squares, h = (cos t, sin t) (`_add_beam`):
+
+        innovation = q - h (a, b)
+        variance   = var(q) + h P h'
+        gain       = P h' / variance
+        (a, b)    += gain innovation
+        P         -= gain h P
+        cost      += innovation^2 / variance    adds up to the squared residuals of the final line
+
+    Partition. With F(j) the least cost of beams 0..j and C(i, j) the cost of the line of i..j,
+
+        F(-1) = 0,    F(j) = min over i <= j of F(i - 1) + price + C(i, j)
+
+    A lane holds one i, and its cost is the term under the minimum. At each beam all lanes take the
+    beam in, and a new one starts with i = j. To bound their number, it replaces the one that cost
+    most after the beam before; with as many lanes as beams the partition is optimal. From the best
+    i of each beam the first beams of the segments follow backwards (`_backtrack`).
+
+    Args:
+        scan: The scan.
+        breaks: (R,) bool, a segment must begin at this beam.
+        lidar: The scanner.
+        range_std: [m] standard deviation of a range.
+        segment_cost: Cost of a segment, in squared standard deviations.
+        outlier_cost: Bound of the cost of one beam; a beam that reaches it does not change the line.
+        num_candidates: C, number of candidates that are kept.
+        roughness_std: [m] standard deviation of the wall about its line.
+        roughness_length: [m] length of wall over which that deviation is the same.
+        max_incidence: Standard deviation of the tangent of the angle of incidence in the prior.
+
+    References:
+        Jackson et al., An algorithm for optimal partitioning of data on an interval, 2005;
+        Killick, Fearnhead, Eckley, Optimal detection of changepoints with a linear computational
+        cost, 2012.
+    """
+    q = 1.0 / jnp.maximum(scan.ranges, 0.02)
+    beam = jnp.arange(lidar.num_beams, dtype=jnp.int32)
+    ray = unit_vector(beam_angles(lidar)).astype(q.dtype)
+    lane = jnp.arange(num_candidates, dtype=jnp.int32)
+
+    def variance(q: Array, foot: Array) -> Array:
+        """Variance [1/m^2] of q = 1 / r on a line whose foot has the inverse distance `foot`.
+
+        A range error e changes q by -q^2 e, an offset e of the wall by -q foot e. The offset is
+        the same for the grain q^2 / (step foot) beams that hit one grain, so that one beam counts
+        the less, the more of them there are.
+        """
+        wall = foot * jnp.maximum(foot, roughness_length / lidar.angle_increment * q * q)
+        return q * q * ((range_std * q) ** 2 + roughness_std**2 * wall)
+
+    def step(carry: tuple[LineCandidates, Array, Array], observed: tuple):
+        old, least_cost, worst = carry
+        index, q, cosine, sine, must_begin = observed
+        foot = jnp.sqrt(old.line[0] ** 2 + old.line[1] ** 2)
+        extended = _add_beam(old, q, (cosine, sine), variance(q, foot), outlier_cost)
+        extended = extended._replace(cost=jnp.where(must_begin, jnp.inf, extended.cost))
+        zero = jnp.zeros_like(q)
+        prior_cov = variance(q, q), zero, (max_incidence * q) ** 2
+        begun = LineCandidates(
+            least_cost + segment_cost, index, (cosine, sine), (q, zero), prior_cov
+        )
+        new = jax.tree.map(lambda x, y: jnp.where(lane == worst, x, y), begun, extended)
+        best, worst = jnp.argmin(new.cost), jnp.argmax(new.cost).astype(jnp.int32)
+        (cos0, sin0), (a, b) = jax.tree.map(lambda x: x[best], (new.heading, new.line))
+        normal = cos0 * a - sin0 * b, sin0 * a + cos0 * b  # (a, b) turned to the robot frame
+        return (new, new.cost[best], worst), (new.first[best], normal)
+
+    zero, one = jnp.zeros(num_candidates, q.dtype), jnp.ones(num_candidates, q.dtype)
+    unused = LineCandidates(one * jnp.inf, lane, (one, zero), (zero, zero), (one, zero, one))
+    must_begin = breaks | ~scan.hit
+    start = unused, jnp.zeros((), q.dtype), jnp.int32(0)
+    _, (first, normal) = lax.scan(step, start, (beam, q, ray[:, 0], ray[:, 1], must_begin))
+    normal = jnp.stack(normal, axis=1)
+    size = jnp.sqrt(jnp.maximum(dot(normal, normal), 1e-12))
+    return Partition(_backtrack(beam, first), normal / size[:, None])
+
+
+def _add_beam(
+    lanes: LineCandidates, q: Array, ray: tuple[Array, Array], variance: Array, outlier: float
+) -> LineCandidates:
+    """Extend all segments by one beam: a step of recursive least squares, see `partition_beams`.
+
+    Args:
+        lanes: The segments up to the beam before.
+        q: [1/m] inverse range of the beam.
+        ray: Cosine and sine of its bearing.
+        variance: (C,) [1/m^2] of q, on the line of each.
+        outlier: Squared standard deviations from which on the beam does not change a line.
+    """
+    (cosine, sine), (cos0, sin0) = ray, lanes.heading
+    (a, b), (aa, ab, bb) = lanes.line, lanes.cov
+    # h = (cos t, sin t), and P h'.
+    cos_t, sin_t = cosine * cos0 + sine * sin0, sine * cos0 - cosine * sin0
+    cov_a, cov_b = aa * cos_t + ab * sin_t, ab * cos_t + bb * sin_t
+    innovation = q - a * cos_t - b * sin_t
+    total = variance + cos_t * cov_a + sin_t * cov_b
+    squared = innovation * innovation / total
+    inverse = jnp.where(squared < outlier, 1.0 / total, 0.0)
+    return LineCandidates(
+        cost=lanes.cost + jnp.minimum(squared, outlier),
+        first=lanes.first,
+        heading=lanes.heading,
+        line=(a + cov_a * inverse * innovation, b + cov_b * inverse * innovation),
+        cov=(
+            aa - cov_a * inverse * cov_a,
+            ab - cov_a * inverse * cov_b,
+            bb - cov_b * inverse * cov_b,
+        ),
+    )
+
+
+def _backtrack(beam: Array, first: Array) -> Array:
+    """Beams (R,) bool at which segments begin.
+
+    Args:
+        beam: (R,) int32 0..R-1.
+        first: (R,) int32 first beam of the last segment of the best partition up to each beam.
+    """
+
+    def step(segment_first: Array, here: tuple[Array, Array]):
+        index, first_before = here
+        begins = index == segment_first
+        return jnp.where(begins, first_before, segment_first), begins
+
+    return lax.scan(step, first[-1], (beam, jnp.roll(first, 1)), reverse=True)[1]
+
+
+def longest_intervals(begins: Array, hit: Array, *, capacity: int) -> BeamIntervals:
+    """The segments with most beams, in the order of the beams.
+
+    Args:
+        begins: (R,) bool, a segment begins at this beam.
+        hit: (R,) bool, the beam returned; segments of beams that did not are left out.
+        capacity: K.
+    """
+    beams = hit.size
+    beam = jnp.arange(beams, dtype=jnp.int32)
+    next_first = lax.cummin(jnp.where(begins, beam, beams), reverse=True)
+    last = jnp.append(next_first[1:], beams) - 1
+    size, index = lax.top_k(jnp.where(begins & hit, last - beam + 1, 0), capacity)
+    first = jnp.sort(jnp.where(size > 0, index, NO_BEAM))
+    return BeamIntervals(first, last.at[first].get(mode="fill", fill_value=-1))
+
+
+def line_moments(xy: Array, weight: Array, of: Array, *, lines: int) -> Moments:
+    """Weighted moments of the points of each of K lines.
+
+    Args:
+        xy: (R, 2) [m] points.
+        weight: (R,) weight of each.
+        of: (R,) int32 line of each point; other numbers than 0..K-1 count nowhere.
+        lines: K.
+    """
+    one_hot = (of[None] == jnp.arange(lines, dtype=jnp.int32)[:, None]).astype(xy.dtype)
+    weighted = weight[:, None] * xy
+    sums = one_hot @ jnp.concatenate([weight[:, None], weighted], axis=1)
+    total = sums[:, 0]
+    mean = sums[:, 1:] / jnp.maximum(total, 1e-9)[:, None]
+    offset = xy - mean.at[of].get(mode="clip")
+    wx, wy = weight * offset[:, 0], weight * offset[:, 1]
+    products = jnp.stack([wx * offset[:, 0], wx * offset[:, 1], wy * offset[:, 1]], axis=1)
+    return Moments(total, mean, one_hot @ products)
+
+
+def principal_axes(scatter: Array) -> tuple[Array, Array, Array]:
+    """Principal axes of scatter matrices: total least squares lines.
+
+    The eigenvalues of [[xx, xy], [xy, yy]] are half +- tilt, half = (xx + yy) / 2 and
+    tilt^2 = ((xx - yy) / 2)^2 + xy^2; the larger one's axis has the angle atan2(xy, part) / 2 with
+    part = (xx - yy) / 2. Equal eigenvalues give the axis x, with finite derivatives.
+
+    Args:
+        scatter: (..., 3) xx, xy, yy.
+
+    Returns:
+        Unit normal (..., 2) of the line, sum of squares across it (...,) and along it (...,).
+    """
+    xx, xy, yy = scatter[..., 0], scatter[..., 1], scatter[..., 2]
+    half, part = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    flat = (jnp.abs(xy) < 1e-12) & (jnp.abs(part) < 1e-12)
+    angle = 0.5 * jnp.arctan2(jnp.where(flat, 0.0, xy), jnp.where(flat, 1.0, part))
+    tilt = jnp.sqrt(jnp.where(flat, 1e-24, part**2 + xy**2))
+    return unit_vector(angle + 0.5 * jnp.pi), jnp.maximum(half - tilt, 0.0), half + tilt

@@ -1,0 +1,249 @@
+"""Segmentation of a scan into straight wall segments with weighted line fits."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import dot, unit_vector
+from jaxslam.core.types import Array
+from jaxslam.frontend import line_fitting, segment_ends
+from jaxslam.frontend.lidar import beam_angles, beam_ends
+from jaxslam.frontend.line_fitting import BeamIntervals
+from jaxslam.frontend.segment_ends import (
+    EndBeams,
+    FittedLines,
+    SegmentEnds,
+    free_ends,
+    project_ends,
+    segment_corners,
+    vector_length,
+)
+from jaxslam.frontend.segments import Segments, SegmentSpec
+
+
+class _Pieces(NamedTuple):
+    """Pieces of a scan between its cuts; those with most beams have a slot 0..K-1 each.
+
+    Attributes:
+        spans: (K,) first and last beam.
+        of_beam: (R,) int32 slot of each beam, K for none.
+        valid: (K,) bool.
+        fitted: (K,) bool, valid and of three beams or more: a line is fitted.
+        overflow: () bool, there are more pieces than slots.
+        surplus: () int32 slot of the fewest beams; if there are more pieces, it takes these too.
+    """
+
+    spans: BeamIntervals
+    of_beam: Array
+    valid: Array
+    fitted: Array
+    overflow: Array
+    surplus: Array
+
+
+def range_jumps(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Array:
+    """Whether the wall is interrupted before each beam (R,) bool.
+
+    On a straight wall, however grazing, 1 / r is a sinusoid of the bearing, so that
+    1 / r[i+1] + 1 / r[i-1] = 2 cos(step) / r[i]. Two successive hits that are far apart are no jump
+    if the two beams before them predict the second, or the two after them the first.
+    """
+    r = scan.ranges
+    xy = beam_ends(lidar, scan)
+    x, y = xy[:, 0], xy[:, 1]
+    wide = vector_length(x - jnp.roll(x, 1), y - jnp.roll(y, 1)) > spec.jump_distance
+    twice = 2 * jnp.cos(jnp.asarray(lidar.angle_increment, r.dtype))
+
+    def prediction_error(second: Array, nearest: Array, measured: Array) -> Array:
+        """Error [m] of a range from the nearest beam and the second, less what is uneven."""
+        inverse = twice / nearest - 1.0 / second
+        predicted = jnp.where(inverse > 0.0, 1.0 / jnp.maximum(inverse, 1e-6), jnp.inf)
+        # An offset of the wall changes a range by 1 / cos(angle of incidence) times as much.
+        slant = vector_length(nearest - second, nearest * lidar.angle_increment) / (
+            nearest * lidar.angle_increment
+        )
+        return jnp.abs(predicted - measured) - 2.0 * spec.roughness_std * slant
+
+    # Beam i from i-1 and i-2, and beam i-1 from i and i+1.
+    forward = prediction_error(jnp.roll(r, 2), jnp.roll(r, 1), r)
+    backward = prediction_error(jnp.roll(r, -1), r, jnp.roll(r, 1))
+    # Two ranges of noise s extrapolate with about 2.2 s; a far wall may also bend a little.
+    tolerance = 5.0 * lidar.range_std + 0.05 * jnp.abs(r - jnp.roll(r, 1))
+    smooth = (forward < tolerance) | (backward < tolerance)
+    broken = ~scan.hit | ~jnp.roll(scan.hit, 1) | (wide & ~smooth)
+    return broken.at[0].set(True)
+
+
+def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
+    """Straight wall segments of a scan, in the order of its beams.
+
+    Two segments seen by the robot R, 0 and 1, counter-clockwise:
+
+          ==========  wall further away
+                .
+                 .  beam beyond the end
+                  .
+        ends[1, 1]  o-----------------------+  ends[1, 0] = ends[0, 1]
+        occluding    .      normal[1]       |  a corner: meets[0], both ends real
+        end: sharp    .         |           |
+        and real       .        v           |
+                        .                   |  ^
+                         R    normal[0] <-- |  | along[0]
+                                            o  ends[0, 0]
+                                               only the view ends here: not real
+
+    Steps:
+
+    1. Split the beams at jumps and where straight lines explain them best (`line_fitting.partition_beams`).
+    2. Give the pieces with most beams a slot each (`_longest_pieces`). If there are more than
+       `capacity`, the slot of the fewest beams takes all others too, and is not valid: its beams
+       are obstacles without a line.
+    3. Fit a line to each by weighted total least squares (`_fit_lines`).
+    4. Project the outermost hits onto the lines (`project_ends`).
+    5. Intersect the lines of adjacent segments: corners (`segment_corners`).
+    6. Classify the other ends; an occluding end is half a beam beyond its hit (`free_ends`).
+
+    Args:
+        scan: The scan.
+        lidar: Its scanner.
+        spec: Parameters.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    xy = beam_ends(lidar, scan)
+    jump = range_jumps(lidar, spec, scan)
+    noise = max(lidar.range_std, 0.005)
+    cut = line_fitting.partition_beams(
+        lidar,
+        scan,
+        jump,
+        noise,
+        segment_cost=spec.segment_cost,
+        outlier_cost=spec.outlier_cost,
+        num_candidates=spec.num_candidates,
+        roughness_std=spec.roughness_std,
+        roughness_length=spec.roughness_length,
+    )
+    pieces = _longest_pieces(cut.begins, scan.hit, spec.max_segments)
+    end_beams = _end_beams(scan.ranges, xy, jump, cut.normal, pieces.spans)
+    line = _fit_lines(
+        xy, unit_vector(beam_angles(lidar)).astype(xy.dtype), pieces, end_beams, noise, spec
+    )
+    x, y = project_ends(end_beams, line, pieces.fitted)
+    adjacent = segment_ends.adjacent(pieces.spans, end_beams)
+    corner, meets = segment_corners(line, x, y, adjacent, pieces.fitted, noise, lidar, spec)
+    free, occluding = free_ends(line, x, y, end_beams, pieces.fitted, lidar)
+
+    # The corner of segments k and k + 1 is the last end of k and the first of k + 1.
+    at_corner = jnp.stack([*corner, meets.astype(x.dtype)])
+    at_corner = jnp.stack([jnp.roll(at_corner, 1, axis=1), at_corner], axis=2)  # (6, K, 2)
+    ends = SegmentEnds(*jnp.where(at_corner[5:] > 0.0, at_corner[:5], jnp.stack(free)))
+    cov = jnp.stack([ends.cov_xx, ends.cov_xy, ends.cov_xy, ends.cov_yy], axis=2)
+    surplus_beam = scan.hit & (pieces.of_beam == spec.max_segments) & pieces.overflow
+    return Segments(
+        normal=jnp.stack([line.nx, line.ny], axis=1),
+        centre=line.centre,
+        ends=jnp.stack([ends.x, ends.y], axis=2),
+        end_cov=cov.reshape(spec.max_segments, 2, 2, 2),
+        end_is_real=occluding | jnp.stack([jnp.roll(adjacent, 1), adjacent], axis=1),
+        end_occludes=occluding,
+        offset_variance=line.offset_variance,
+        angle_variance=line.angle_variance,
+        count=pieces.spans.size,
+        meets_next=meets,
+        valid=pieces.valid,
+        segment_of_beam=jnp.where(surplus_beam, pieces.surplus, pieces.of_beam),
+    )
+
+
+def _longest_pieces(begins: Array, hit: Array, capacity: int) -> _Pieces:
+    """The `capacity` pieces with most beams; `begins` and `hit` (R,) as of `line_fitting.longest_intervals`."""
+    spans = line_fitting.longest_intervals(begins, hit, capacity=capacity)
+    fewest = jnp.argmin(spans.size).astype(jnp.int32)
+    overflow = jnp.sum(begins & hit, dtype=jnp.int32) > capacity
+    own = ~(overflow & (jnp.arange(capacity, dtype=jnp.int32) == fewest))
+    return _Pieces(
+        spans=spans,
+        of_beam=spans.interval_of_beam(hit.size),
+        valid=own & (spans.size > 0),
+        fitted=own & (spans.size >= 3),
+        overflow=overflow,
+        surplus=fewest,
+    )
+
+
+def _end_beams(
+    ranges: Array, xy: Array, jump: Array, normal: Array, spans: BeamIntervals
+) -> EndBeams:
+    """First and last beam of each piece and what is beside them, by one gather.
+
+    Args:
+        ranges: (R,) [m].
+        xy: (R, 2) [m] hits.
+        jump: (R,) bool, of `range_jumps`.
+        normal: (R, 2), of `Partition`.
+        spans: (K,) first and last beams.
+    """
+    jump = jump.astype(ranges.dtype)
+    before = jnp.stack([jnp.roll(ranges, 1), jump], axis=1)
+    after = jnp.stack([jnp.roll(ranges, -1), jnp.append(jump[1:], 1.0)], axis=1)
+    # Range 0 outside the field of view: no wall ends there, only the view of it.
+    before, after = before.at[0].set(0.0), after.at[-1, 0].set(0.0)
+    table = jnp.concatenate([xy, normal, ranges[:, None], before, after], axis=1)
+    first, last = jnp.minimum(spans.first, ranges.size - 1), jnp.maximum(spans.last, 0)
+    beams = table[jnp.stack([first, last], axis=1)]  # (K, 2, 9)
+    return EndBeams(
+        first=first,
+        last=last,
+        x=beams[:, :, 0],
+        y=beams[:, :, 1],
+        ranges=beams[:, :, 4],
+        range_beyond=jnp.stack([beams[:, 0, 5], beams[:, 1, 7]], axis=1),
+        jump=jnp.stack([beams[:, 0, 6], beams[:, 1, 8]], axis=1),
+        normal=beams[:, 1, 2:4],
+    )
+
+
+def _fit_lines(
+    xy: Array, ray: Array, pieces: _Pieces, end_beams: EndBeams, noise: float, spec: SegmentSpec
+) -> FittedLines:
+    """Weighted total least squares: one line for each piece.
+
+    A range error e moves a point by e cos(incidence) across the wall, so grazing beams count more:
+    weight = 1 / ((noise cos)^2 + rough^2). Of six beams or more the outermost two do not count:
+    they may be mixed pixels. With W the sum of the weights and S that of weight times the squared
+    coordinate along the line, the variances are scale / W of the offset and scale / S of the angle.
+    The scale is the reduced chi-square, with four more degrees of freedom at their expectation.
+
+    Args:
+        xy: (R, 2) [m] hits.
+        ray: (R, 2) unit vectors of the beams.
+        pieces: The pieces.
+        end_beams: Their outermost beams.
+        noise: [m] standard deviation of a range.
+        spec: Parameters.
+    """
+    count, of_beam = pieces.spans.size, pieces.of_beam
+    trim = jnp.where(count >= 6, 1, 0)
+    inner = jnp.stack([end_beams.first + trim, end_beams.last - trim], axis=1)
+    inner = inner.at[of_beam].get(mode="clip")  # (R, 2)
+    beam = jnp.arange(of_beam.size, dtype=jnp.int32)
+    used = (of_beam < spec.max_segments) & (beam >= inner[:, 0]) & (beam <= inner[:, 1])
+    cos_incidence = dot(end_beams.normal.at[of_beam].get(mode="clip"), ray)
+    weight = jnp.where(used, 1.0 / ((noise * cos_incidence) ** 2 + spec.point_std**2), 0.0)
+    sums = line_fitting.line_moments(xy, weight, of_beam, lines=spec.max_segments)
+    normal, chi_square, spread = line_fitting.principal_axes(sums.scatter)
+    sign = jnp.where(dot(normal, sums.mean) > 0.0, -1.0, 1.0)  # towards the robot
+    degrees = jnp.maximum(count - 2 * trim - 2, 0).astype(xy.dtype)
+    scale = (4.0 + chi_square) / (4.0 + degrees)
+    return FittedLines(
+        nx=sign * normal[:, 0],
+        ny=sign * normal[:, 1],
+        cx=sums.mean[:, 0],
+        cy=sums.mean[:, 1],
+        offset_variance=scale / jnp.maximum(sums.weight, 1e-9),
+        angle_variance=scale / jnp.maximum(spread, 1e-6),
+        centre=sums.mean,
+    )

@@ -1,0 +1,120 @@
+"""Sources of the Voronoi automaton in a scan: edge codes (paper) or straight segments (default).
+
+Edge codes label each boundary cell by the pattern of its neighbours (`edge_codes`). A segment is one
+straight piece of wall, found in the order of the beams, with its line fit (`find_segments`).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import dot
+from jaxslam.core.types import Array
+from jaxslam.frontend.grid import GridSpec, cell_of
+from jaxslam.frontend.lidar import beam_ends
+
+
+class Segments(NamedTuple):
+    """Straight wall segments of a scan, counter-clockwise in the order of its beams, padded to K.
+
+    Robot frame throughout. See `find_segments` for a figure.
+
+    Attributes:
+        normal: (K, 2) unit normal of the line, towards the robot.
+        centre: (K, 2) [m] weighted mean of the points, on the line.
+        ends: (K, 2, 2) [m] first and last end.
+        end_cov: (K, 2, 2, 2) [m^2] covariance of each end.
+        end_is_real: (K, 2) bool, the wall itself ends there, not only the view of it.
+        end_occludes: (K, 2) bool, occluding end: what lies behind it is hidden by the wall.
+        offset_variance: (K,) [m^2] variance of the line across itself, at `centre`.
+        angle_variance: (K,) [rad^2] variance of its direction.
+        count: (K,) int32 number of beams.
+        meets_next: (K,) bool, this segment meets the next one in a corner, at `ends[:, 1]`.
+        valid: (K,) bool, False for padding and for the slot of all surplus segments.
+        segment_of_beam: (R,) int32 segment of each beam, K for none.
+    """
+
+    normal: Array
+    centre: Array
+    ends: Array
+    end_cov: Array
+    end_is_real: Array
+    end_occludes: Array
+    offset_variance: Array
+    angle_variance: Array
+    count: Array
+    meets_next: Array
+    valid: Array
+    segment_of_beam: Array
+
+    @property
+    def tangent(self) -> Array:
+        """Unit vectors (K, 2) from first to last end: counter-clockwise around the robot."""
+        return jnp.stack([self.normal[..., 1], -self.normal[..., 0]], axis=-1)
+
+    @property
+    def length(self) -> Array:
+        """Length (K,) [m]."""
+        return dot(self.ends[:, 1] - self.ends[:, 0], self.tangent)
+
+    def line_variance(self, along: Array) -> Array:
+        """Variance (..., K) [m^2] across the line, `along` (..., K) [m] from the centre."""
+        return self.offset_variance + along**2 * self.angle_variance
+
+
+class SegmentSpec(NamedTuple):
+    """Parameters of the segmentation of scans; static under jit.
+
+    Attributes:
+        max_segments: K, most segments; one label bit each, and one for the automaton.
+        jump_distance: [m] two successive hits nearer to each other than this are never a jump.
+        segment_cost: Cost of a segment, in squared standard deviations.
+        outlier_cost: Bound of the cost of one beam, in squared standard deviations.
+        num_candidates: Candidates that the partition keeps at each beam.
+        roughness_std: [m] standard deviation of a wall about its line that does not split it.
+        roughness_length: [m] length of wall over which that deviation is the same.
+        point_std: [m] standard deviation added to each point in the line fit.
+        corner_tolerance: [m] distance at most from the ends of two adjacent segments to their corner.
+    """
+
+    max_segments: int = 31
+    jump_distance: float = 0.2
+    segment_cost: float = 20.0
+    outlier_cost: float = 16.0
+    num_candidates: int = 16
+    roughness_std: float = 0.02
+    roughness_length: float = 0.03
+    point_std: float = 0.002
+    corner_tolerance: float = 0.15
+
+
+def segment_cells(
+    lidar: Lidar, spec: GridSpec, scan: Scan, segments: Segments, *, points_per_gap: int = 6
+) -> Array:
+    """Segment (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
+
+    Args:
+        scan: The scan.
+        lidar: Its scanner.
+        segments: Its segments; where two share a cell, the later one has it.
+        spec: The grid to draw on.
+        points_per_gap: Points drawn from each hit to the next of the same segment.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    xy, of_beam = beam_ends(lidar, scan), segments.segment_of_beam
+    capacity = segments.valid.size
+    is_last = jnp.arange(of_beam.size, dtype=jnp.int32) == of_beam.size - 1
+    continues = (of_beam == jnp.roll(of_beam, -1)) & ~is_last
+    continues &= segments.valid[jnp.minimum(of_beam, capacity - 1)]
+    fraction = jnp.where(
+        continues[:, None], jnp.arange(points_per_gap, dtype=xy.dtype) / points_per_gap, 0.0
+    )
+    drawn = xy[:, None] + fraction[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
+    drawn = jnp.where((of_beam < capacity)[:, None, None], drawn, jnp.inf)
+    index = cell_of(spec, drawn.reshape(-1, 2))
+    cells = jnp.full(spec.shape, -1, jnp.int8)
+    values = jnp.repeat(of_beam, points_per_gap).astype(jnp.int8)
+    return cells.at[index[:, 0], index[:, 1]].max(values, mode="drop")

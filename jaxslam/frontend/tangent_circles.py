@@ -1,0 +1,261 @@
+"""Empty circles tangent to three or more walls: the junctions of a Voronoi diagram of segments.
+
+A junction of the generalised Voronoi diagram of wall segments is as far from three walls and no
+farther from any other: it is the centre of a circle that touches three walls and that none cuts.
+
+               wall 0
+        -----------+-----------      c = (x, y)  centre of the circle
+                   | f0              f_k         foot: the point of wall k nearest to c
+                   |                 d_k         distance |f_k - c|
+        |          |          |      t_k         unit vector (f_k - c) / d_k
+        |          |          |
+     f1 +----------c----------+ f2   touch:  d_0 = d_1 = d_2 = radius
+        |                     |      empty:  d_j >= radius for every other wall j
+     wall 1                wall 2
+
+`nearest_three_walls` picks the walls to start with, `tangent_circles` solves for the tangent circle and exchanges
+walls until it is empty, `fit_circles` refines the circle with all walls that it touches.
+
+Layout: walls lead (K) and circles trail (C), so that sums and minima over the walls are vectorised
+over all circles.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxslam.core.se2 import dot
+from jaxslam.core.types import Array
+from jaxslam.frontend.segments import Segments
+
+MAX_FOOT_COSINE = 0.95
+"""Cosine of the angle between two feet above which they may belong to one corner or wall."""
+
+
+class WallSegments(NamedTuple):
+    """Wall segments, component by component; C is 1 for walls that all circles share.
+
+    Attributes:
+        start: ((K, C), (K, C)) [m] x and y of the first end, robot frame.
+        along: ((K, C), (K, C)) unit vector from the first end to the second.
+        size: (K, C) [m] length.
+        valid: (K, C) bool, False marks padding.
+    """
+
+    start: tuple[Array, Array]
+    along: tuple[Array, Array]
+    size: Array
+    valid: Array
+
+    def of(self, index: Array) -> "WallSegments":
+        """The walls (N, C) with index (N, C), of its own for each circle; self is (K, 1)."""
+        return jax.tree.map(lambda x: x[:, 0][index], self)
+
+
+class FootPoints(NamedTuple):
+    """Foot of each wall for each circle: the point of the segment nearest to the centre.
+
+    Attributes:
+        distance: (K, C) [m] from the centre to the foot, infinite for padding.
+        toward: ((K, C), (K, C)) unit vector from the centre to the foot, robot frame.
+        along: (K, C) [m] position of the foot along the wall, from its first end.
+    """
+
+    distance: Array
+    toward: tuple[Array, Array]
+    along: Array
+
+
+class TangentCircles(NamedTuple):
+    """Circles tangent to three walls each.
+
+    Attributes:
+        x: (C,) [m] centre, robot frame.
+        y: (C,) [m] centre, robot frame.
+        radius: (C,) [m] mean distance to the three walls.
+        walls: (3, C) int32 index of the walls.
+        penetration: (C,) [m] by which the nearest other wall cuts into the circle; negative if none does.
+        min_angle: (C,) [rad] smallest angle between two of the three feet, seen from the centre.
+        fourth_wall: (C,) int32 nearest wall whose foot lies in another direction than all three feet.
+    """
+
+    x: Array
+    y: Array
+    radius: Array
+    walls: Array
+    penetration: Array
+    min_angle: Array
+    fourth_wall: Array
+
+
+def wall_segments(runs: Segments) -> WallSegments:
+    """Wall segments (K, 1) between the ends of the straight segments of a scan."""
+    start, end = runs.ends[:, 0], runs.ends[:, 1]
+    gap = end - start
+    length = jnp.sqrt(jnp.maximum(dot(gap, gap), 1e-12))
+    along = gap / length[:, None]
+    return WallSegments(
+        start=(start[:, :1], start[:, 1:]),
+        along=(along[:, :1], along[:, 1:]),
+        size=length[:, None],
+        valid=runs.valid[:, None],
+    )
+
+
+def foot_points(x: Array, y: Array, walls: WallSegments) -> FootPoints:
+    """Feet (K, C) of walls (K, C) or (K, 1) for centres x, y (C,) [m, robot frame]."""
+    (start_x, start_y), (along_x, along_y) = walls.start, walls.along
+    x, y = x[None], y[None]
+    position = jnp.clip((x - start_x) * along_x + (y - start_y) * along_y, 0.0, walls.size)
+    dx, dy = start_x + position * along_x - x, start_y + position * along_y - y
+    distance = jnp.sqrt(jnp.maximum(dx * dx + dy * dy, 1e-8))
+    toward = dx / distance, dy / distance
+    return FootPoints(jnp.where(walls.valid, distance, jnp.inf), toward, position)
+
+
+def nearest_wall(distance: Array) -> Array:
+    """Row index (C,) int32 of the smallest entry of each column of (K, C), the first of ties."""
+    index = jnp.arange(len(distance), dtype=jnp.int32)[:, None]
+    smallest = jnp.min(distance, axis=0, keepdims=True)
+    return jnp.min(jnp.where(distance <= smallest, index, len(distance) - 1), axis=0)
+
+
+def foot_cosine(toward: tuple[Array, Array], wall: Array) -> Array:
+    """Cosines (K, C) of the angles between all feet and those of the walls with index (C,)."""
+    tx, ty = toward
+    index = jnp.arange(len(tx), dtype=jnp.int32)[:, None]
+    one_hot = (index == wall[None]).astype(tx.dtype)
+    wall_tx, wall_ty = jnp.sum(one_hot * tx, axis=0), jnp.sum(one_hot * ty, axis=0)
+    return tx * wall_tx[None] + ty * wall_ty[None]
+
+
+def nearest_three_walls(f: FootPoints, alike: float) -> Array:
+    """The three nearest walls whose feet lie in different directions.
+
+    Args:
+        f: Feet of K walls for C circles.
+        alike: Cosine of the smallest angle between two of the three feet.
+
+    Returns:
+        Index (3, C) int32, nearest first.
+    """
+    first = nearest_wall(f.distance)
+    near_first = foot_cosine(f.toward, first)
+    second = nearest_wall(jnp.where(near_first < alike, f.distance, jnp.inf))
+    near_both = jnp.maximum(near_first, foot_cosine(f.toward, second))
+    third = nearest_wall(jnp.where(near_both < alike, f.distance, jnp.inf))
+    return jnp.stack([first, second, third])
+
+
+def _newton(x: Array, y: Array, three: WallSegments) -> tuple[Array, Array, FootPoints]:
+    """Solve d_0 = d_1 = d_2 for the centre by four steps of Newton's method.
+
+    Moving the centre by (u, v) changes distance k to d_k - t_k . (u, v), to first order. All three
+    become equal if
+
+        (t_1 - t_0) . (u, v) = d_1 - d_0
+        (t_2 - t_0) . (u, v) = d_2 - d_0
+
+    which Cramer's rule solves. The determinant is kept away from zero, and each component of a
+    step within 0.4 m.
+
+    Args:
+        x: (C,) [m] initial centre, robot frame.
+        y: (C,) [m] initial centre, robot frame.
+        three: (3, C) the walls.
+
+    Returns:
+        Centres x and y (C,), and the feet (3, C) of the walls there.
+    """
+    foot = foot_points(x, y, three)
+    for _ in range(4):
+        (tx, ty), d = foot.toward, foot.distance
+        ax, ay, gap = tx[1:] - tx[:1], ty[1:] - ty[:1], d[1:] - d[:1]  # rows 1 and 2: (2, C)
+        determinant = ax[0] * ay[1] - ax[1] * ay[0]
+        determinant = jnp.where(jnp.abs(determinant) > 1e-4, determinant, 1e-4)
+        x = x + jnp.clip((gap[0] * ay[1] - gap[1] * ay[0]) / determinant, -0.4, 0.4)
+        y = y + jnp.clip((ax[0] * gap[1] - ax[1] * gap[0]) / determinant, -0.4, 0.4)
+        foot = foot_points(x, y, three)
+    return x, y, foot
+
+
+def _one_of(three: Array, index: Array) -> Array:
+    """Whether each wall, `index` (K, 1), is one of the three (3, C) of a circle: (K, C) bool."""
+    return (index == three[:1]) | (index == three[1:2]) | (index == three[2:])
+
+
+def _most_similar(cosines: list[Array], wall: Array, index: Array) -> Array:
+    """Which of the three walls, 0..2 (C,), has its foot in a direction most like that of `wall`.
+
+    Args:
+        cosines: Three of (K, C), of the angles between every foot and that of one of the three.
+        wall: (C,) index of a wall.
+        index: (K, 1) row numbers.
+    """
+    is_wall = index == wall[None]
+    cosine = [jnp.sum(jnp.where(is_wall, every, 0.0), axis=0) for every in cosines]
+    return nearest_wall(-jnp.stack(cosine))
+
+
+def tangent_circles(
+    x: Array, y: Array, three: Array, walls: WallSegments, *, swaps: int
+) -> TangentCircles:
+    """Circles near x, y that touch three walls and that no wall cuts.
+
+    While another wall j cuts into the circle, it replaces the one of the three whose foot lies in
+    the most similar direction, that is, the wall that it stands in front of. Below, j cuts into the
+    circle and replaces wall 2, since t_j . t_2 is larger than t_j . t_0 and t_j . t_1:
+
+            -------+-------               repeat `swaps` + 1 times:
+        |          f0         |  wall 2       solve for the circle tangent to the three (`_newton`)
+        |              |      |               j = the nearest other wall
+     f1 +          c   + fj   + f2            depth = radius - d_j
+        |              |      |               if depth > 1 mm:
+     wall 1          wall j                       j replaces the wall k of largest t_j . t_k
+
+    The *fourth* wall is the nearest other one whose foot is in none of the three directions (all
+    cosines below `MAX_FOOT_COSINE`). Three junctions may lie close by: those in which it replaces one of the
+    three walls. `junctions.find_junctions` searches these.
+
+    Args:
+        x: (C,) [m] initial centre, robot frame.
+        y: (C,) [m] initial centre, robot frame.
+        three: (3, C) int32 index of the walls to start with.
+        walls: (K, 1) all walls.
+        swaps: How many times a wall may be replaced.
+
+    Returns:
+        The C circles, with `depth` and `fourth` of the last solution.
+    """
+    index = jnp.arange(len(walls.size), dtype=jnp.int32)[:, None]
+
+    def solve_and_swap(x: Array, y: Array, three: Array):
+        x, y, own = _newton(x, y, walls.of(three))
+        every = foot_points(x, y, walls)
+        radius = jnp.mean(own.distance, axis=0)
+        others = jnp.where(_one_of(three, index), jnp.inf, every.distance)  # (K, C)
+        intruder, depth = nearest_wall(others), radius - jnp.min(others, axis=0)
+        (tx, ty), (own_tx, own_ty) = every.toward, own.toward
+        cosines = [tx * own_tx[k][None] + ty * own_ty[k][None] for k in range(3)]
+        replaced = _most_similar(cosines, intruder, index)
+        replaces = jnp.arange(3, dtype=jnp.int32)[:, None] == replaced[None]  # (3, C)
+        replaces &= (depth > 1e-3)[None]
+        largest = jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2])
+        fourth = nearest_wall(jnp.where(largest < MAX_FOOT_COSINE, others, jnp.inf))
+        between = [
+            own_tx[i] * own_tx[j] + own_ty[i] * own_ty[j] for i, j in ((0, 1), (1, 2), (2, 0))
+        ]
+        cosine = jnp.maximum(jnp.maximum(between[0], between[1]), between[2])
+        solved = TangentCircles(x, y, radius, three, depth, cosine, fourth)
+        return (x, y, jnp.where(replaces, intruder[None], three)), solved
+
+    def body(carry, _: None):
+        return solve_and_swap(*carry[0]), None
+
+    zero = jnp.zeros_like(x)
+    unsolved = TangentCircles(x, y, zero, three, zero, zero, jnp.zeros_like(three[0]))
+    (_, last), _ = lax.scan(body, ((x, y, three), unsolved), length=swaps + 1)
+    # Up to here `spread` holds the cosine.
+    return last._replace(min_angle=jnp.arccos(jnp.clip(last.min_angle, -0.9999, 0.9999)))

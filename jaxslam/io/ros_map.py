@@ -1,0 +1,214 @@
+"""ROS occupancy grids: a map_server YAML file and its image.
+
+Reading the YAML needs the extra `[ros]`; images are read by Pillow, which matplotlib installs.
+"""
+
+import math
+import warnings
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam.core.maps import MAX_CELLS, OccupancyMap
+from jaxslam.io.errors import InputError
+from jaxslam.io.output import replace, write_text
+from jaxslam.io.text import lines
+
+MAX_YAML_BYTES = 2**16  # [bytes] of the longest YAML file
+FORMATS = ("PPM", "PNG", "BMP")  # PPM stands for all of PBM, PGM and PPM
+MODES = ("trinary", "scale", "raw")
+FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+
+
+def read(path: str | PathLike) -> OccupancyMap:
+    """Read a map.
+
+    As in map_server, a cell whose occupancy probability exceeds `occupied_thresh` is occupied, one
+    below `free_thresh` is free. Transparent pixels are unknown. The modes trinary and scale differ
+    only in the values between the thresholds, which are unknown here.
+
+    Args:
+        path: YAML file with the fields in `FIELDS`, and optionally `mode`.
+
+    Raises:
+        InputError: PyYAML is not installed; the file is no YAML or lacks a field; a field is of
+            the wrong type or out of range; the image lies outside the map's folder, cannot be
+            read, or has no cells or more than `MAX_CELLS`.
+
+    References:
+        https://docs.nav2.org/configuration/packages/configuring-map-server.html
+    """
+    path = Path(path)
+    fields = _load(path)
+    for name in FIELDS:
+        if name not in fields:
+            raise InputError("missing", path=path, field=name, advice="add it")
+    resolution = _number(path, "resolution", fields["resolution"])
+    if resolution <= 0.0:
+        problem, advice = f"{resolution} is not positive", "give the side of a cell in metres"
+        raise InputError(problem, path=path, field="resolution", advice=advice)
+    origin = fields["origin"]
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise InputError("is not a list of three numbers", path=path, field="origin")
+    origin = np.array([_number(path, "origin", value) for value in origin])
+    negate = fields["negate"]
+    if not isinstance(negate, int) or negate not in (0, 1):
+        raise InputError(f"{_excerpt(negate)} is neither 0 nor 1", path=path, field="negate")
+    mode = fields.get("mode", "trinary")
+    if mode not in MODES:
+        advice = f"the modes are {', '.join(MODES)}"
+        raise InputError(f"unknown mode {_excerpt(mode)}", path=path, field="mode", advice=advice)
+    free_below = _number(path, "free_thresh", fields["free_thresh"])
+    occupied_above = _number(path, "occupied_thresh", fields["occupied_thresh"])
+    for name, value in (("free_thresh", free_below), ("occupied_thresh", occupied_above)):
+        if not 0.0 <= value <= 1.0:
+            raise InputError(f"{value} is not between 0 and 1", path=path, field=name)
+    if free_below >= occupied_above:
+        problem = f"{free_below} is not below the occupied_thresh of {occupied_above}"
+        raise InputError(problem, path=path, field="free_thresh")
+    shade, known = _read_image(_image_path(path, fields["image"]))
+    probability = _occupancy_probability(shade, mode, bool(negate))
+    known &= np.isfinite(probability)
+    occupied = _image_to_grid(known & (probability > occupied_above))
+    free = _image_to_grid(known & (probability < free_below))
+    return OccupancyMap(occupied, free, resolution, origin)
+
+
+def write(path: str | PathLike, occupancy: OccupancyMap) -> None:
+    """Write a map: the YAML file and, beside it, its image of the same name.
+
+    Args:
+        path: YAML file to write, atomically, after the image.
+        occupancy: The map.
+
+    Raises:
+        InputError: A file cannot be written.
+    """
+    path = Path(path)
+    shade = np.where(occupancy.occupied, 0, np.where(occupancy.free, 254, 205)).astype(np.uint8)
+    rows = np.ascontiguousarray(shade.T[::-1])
+    image = path.with_suffix(".pgm")
+    with replace(image) as file:
+        file.write(b"P5\n%d %d\n255\n" % rows.shape[::-1] + rows.tobytes())
+    x, y, heading = (float(value) for value in occupancy.origin)
+    fields = {
+        "image": image.name,
+        "mode": "trinary",
+        "resolution": f"{occupancy.resolution!r}",
+        "origin": f"[{x!r}, {y!r}, {heading!r}]",
+        "negate": "0",
+        "occupied_thresh": "0.65",
+        "free_thresh": "0.196",  # the shade 205 of unknown cells is just above
+    }
+    write_text(path, "".join(f"{name}: {value}\n" for name, value in fields.items()))
+
+
+def _image_to_grid(pixels: np.ndarray) -> np.ndarray:
+    """Cells [x, y] of pixels [row, column], whose rows go down."""
+    return np.ascontiguousarray(pixels[::-1].T)
+
+
+def _occupancy_probability(shade: np.ndarray, mode: str, negate: bool) -> np.ndarray:
+    """Probability (H, W) that a cell is occupied, from its shade in 0..1; NaN where unknown."""
+    if mode != "raw":
+        return shade if negate else 1.0 - shade
+    percent = np.round(255.0 * shade)
+    return np.where(percent <= 100.0, percent / 100.0, np.nan)
+
+
+def _load(path: Path) -> Mapping[str, Any]:
+    """The fields of a map's YAML file, not yet checked."""
+    try:
+        import yaml
+    except ImportError:
+        advice = "pip install 'jaxslam[ros]'"
+        raise InputError("PyYAML is needed to read it", path=path, advice=advice) from None
+    advice = "name the YAML file of a map, as map_saver writes it"
+    text = b""
+    for _, line in lines(path):
+        text += line
+        if len(text) > MAX_YAML_BYTES:
+            raise InputError(f"is longer than {MAX_YAML_BYTES} bytes", path=path, advice=advice)
+    try:
+        fields = yaml.safe_load(text)
+    except yaml.MarkedYAMLError as error:
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
+        problem = f"is not YAML ({error.problem})"
+        raise InputError(problem, path=path, line=line, advice=advice) from None
+    except (yaml.YAMLError, RecursionError, ValueError):
+        raise InputError("is not YAML", path=path, advice=advice) from None
+    if not isinstance(fields, dict):
+        raise InputError("holds no fields", path=path, advice=advice)
+    return fields
+
+
+def _number(path: Path, field: str, value: Any) -> float:
+    """A finite number, also given as text, because YAML 1.1 reads 5e-2 as text."""
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{_excerpt(value)} is not a finite number", path=path, field=field)
+    return number
+
+
+def _excerpt(value: Any) -> str:
+    """A value as text for an error, shortened."""
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _image_path(path: Path, name: Any) -> Path:
+    """Path of a map's image, which must be in the map's folder or below."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise InputError(f"{_excerpt(name)} is no file name", path=path, field="image")
+    image = path.parent / name
+    folders = {path.parent.resolve(), path.resolve().parent}
+    inside = any(image.resolve().is_relative_to(folder) for folder in folders)
+    if Path(name).is_absolute() or not inside:
+        problem = f"{_excerpt(name)} is outside the map's folder"
+        advice = "put the image beside the YAML file and name it without its folder"
+        raise InputError(problem, path=path, field="image", advice=advice)
+    return image
+
+
+def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Shade (H, W) float32 from 0 (black) to 1 (white), and whether opaque (H, W) bool."""
+    from PIL import Image, UnidentifiedImageError
+
+    advice = "name a PGM, PNG or BMP image"
+    try:
+        with warnings.catch_warnings():
+            # Pillow warns of its own limit; ours is checked below.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=FORMATS) as image:
+                width, height = image.size
+                if not 0 < width * height <= MAX_CELLS:
+                    problem = f"{width} x {height} cells are not between 1 and {MAX_CELLS}"
+                    raise InputError(problem, path=path, advice="cut the map into parts")
+                return _pixels(image)
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError("does not exist", path=path, advice="check the field image") from None
+    except Image.DecompressionBombError:
+        raise InputError(f"has more than {MAX_CELLS} cells", path=path) from None
+    except UnidentifiedImageError:
+        raise InputError("is no image that can be read", path=path, advice=advice) from None
+    except (OSError, ValueError, SyntaxError, EOFError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"cannot be read ({reason})", path=path, advice=advice) from None
+
+
+def _pixels(image: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Shade and opacity of an open Pillow image."""
+    if image.mode == "I" or image.mode.startswith("I;16"):  # 16 bits a pixel
+        shade = np.asarray(image).astype(np.float32) / np.float32(65535)
+        return shade, np.ones(shade.shape, bool)
+    values = np.asarray(image.convert("RGBA"))
+    shade = values[..., :3].mean(axis=2, dtype=np.float32) / np.float32(255)
+    return shade, values[..., 3] > 127

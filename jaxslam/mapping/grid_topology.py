@@ -1,0 +1,153 @@
+"""Topological map of an occupancy grid: the medial cells of free space as a graph.
+
+Nodes are the junctions and dead ends of the medial cells, arcs the paths of cells between them.
+Two nodes may be joined by several arcs, and a ring without a junction is one node with a loop.
+
+    medial cells (`medial_axis`) -> trace into a graph of cells -> clean up: drop short spurs, join arcs
+    through nodes of degree 2, merge close junctions -> polylines in the map frame
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from jaxslam.core import polylines
+from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.types import JUNCTION
+from jaxslam.mapping import medial_axis
+from jaxslam.mapping.cell_graph import CellGraph, trace_cells
+from jaxslam.mapping.cell_graph_cleanup import clean_up
+from jaxslam.mapping.medial_axis import FreeConfigurations
+
+DEAD_END_ANGLE = np.radians(
+    120.0
+)  # obstacles seen under a larger angle make dead ends; corners do not
+STAGES = ("distances", "thinning", "graph")
+UNKNOWN_MARGIN = 2  # [cells] unknown cells this close to an occupied one are part of the wall
+
+
+class GridTopology(NamedTuple):
+    """Topological map of an occupancy grid.
+
+    Attributes:
+        graph: The map, in the frame of the grid's map.
+        num_regions: Number of connected regions of free configurations in it.
+        reached_area: [m^2] their area: where the centre of the robot can be.
+        unreached_area: [m^2] area of the regions that are not in it.
+    """
+
+    graph: TopologicalMap
+    num_regions: int
+    reached_area: float
+    unreached_area: float
+
+
+def extract_topology(
+    occupied: np.ndarray,
+    free: np.ndarray,
+    *,
+    resolution: float,
+    origin: np.ndarray,
+    robot_radius: float,
+    min_obstacle_size: float = 0.1,
+    min_region_area: float | None = None,
+    callback: Callable[[str], object] = str,
+) -> GridTopology:
+    """Topological map of the free space that a robot can reach.
+
+    Every region in which the robot's centre can move becomes one connected graph with a cycle
+    around each obstacle that it can drive around. A spur (an arc with a dead end) is kept if it is
+    longer than the clearance at its root. Unknown cells keep the robot out, but are no walls: they
+    alone make no dead end, and islands of them smaller than the robot are filled.
+
+    Args:
+        occupied: (H, W) bool; i grows with x, j with y.
+        free: (H, W) bool; a cell that is neither is unknown.
+        resolution: [m] side of a cell.
+        origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
+        robot_radius: [m] radius of the robot. Nodes keep this distance from what is not free; so do
+            arcs, but for less than a cell where the simplified polyline cuts a bend.
+            `arc_clearance` is that of the polyline.
+        min_obstacle_size: [m] obstacles in free space no wider than this are noise.
+        min_region_area: [m^2] smallest region that is mapped; None for the largest region alone.
+        callback: Callback, called with the name of each of the `STAGES` as it begins.
+
+    Raises:
+        ValueError: The robot fits nowhere.
+    """
+    callback(STAGES[0])
+    free = medial_axis.free_space(
+        occupied,
+        free,
+        min_obstacle_size=min_obstacle_size / resolution,
+        min_unknown_size=2 * robot_radius / resolution,
+    )
+    space = medial_axis.free_configurations(free, clearance=robot_radius / resolution)
+    areas = space.region_sizes * resolution**2
+    if not areas.size:
+        raise ValueError(f"has no free space for a robot with a clearance of {robot_radius:g} m")
+    count = 1 if min_region_area is None else max(1, int(np.sum(areas >= min_region_area)))
+    chosen = (space.region > 0) & (space.region <= count)
+    wall = ndimage.binary_dilation(occupied, structure=np.ones((3, 3)), iterations=UNKNOWN_MARGIN)
+    anchors = medial_axis.between_walls(space, wall, angle=DEAD_END_ANGLE) & chosen
+    callback(STAGES[1])
+    cells = medial_axis.medial_cells(space, chosen, anchors)
+    callback(STAGES[2])
+    cell_graph = trace_cells(cells, space.distance)
+    clean_up(cell_graph, space.distance)
+    graph = _to_map(cell_graph, space, resolution, np.asarray(origin, float))
+    return GridTopology(graph, count, float(areas[:count].sum()), float(areas[count:].sum()))
+
+
+# From cells to the map frame.
+
+
+def _to_map(
+    cell_graph: CellGraph, space: FreeConfigurations, resolution: float, origin: np.ndarray
+) -> TopologicalMap:
+    """The graph in the map frame [m]; `origin` (3,) is the pose of the grid's corner."""
+    names = list(cell_graph.nodes)
+    index = {node: n for n, node in enumerate(names)}
+    cells = np.array([cell_graph.nodes[node] for node in names])
+    cosine, sine = np.cos(origin[2]), np.sin(origin[2])
+    rotation = np.array([[cosine, sine], [-sine, cosine]])  # of row vectors
+
+    def to_map(points: np.ndarray) -> np.ndarray:
+        return (points + 0.5) * resolution @ rotation + origin[:2]
+
+    arcs = list(cell_graph.arcs.values())
+    lines = tuple(to_map(arc.line) for arc in arcs)
+    return TopologicalMap(
+        id=np.arange(len(names)),
+        xy=to_map(cells),
+        kind=np.full(len(names), JUNCTION),
+        clearance=space.distance[tuple(cells.T)] * resolution,
+        arc_ends=np.array([[index[node] for node in arc.ends] for arc in arcs], int).reshape(-1, 2),
+        arc_length=np.array([polylines.length(line) for line in lines], float),
+        arc_clearance=np.array(
+            [_smallest_clearance(arc.line, space.nearest_obstacle) for arc in arcs]
+        )
+        * resolution,
+        arc_lines=lines,
+    )
+
+
+def _smallest_clearance(line: np.ndarray, foot: np.ndarray) -> float:
+    """Smallest distance [cells] from a polyline to the edge of an obstacle.
+
+    The polyline is sampled every quarter of a cell. The nearest obstacle of a sample is taken to be
+    one of those of the four cells around it.
+
+    Args:
+        line: (n, 2) [cells].
+        foot: (2, H, W) index of the nearest obstacle of each cell.
+    """
+    at_point = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    wanted = np.unique(np.concatenate([at_point, np.arange(0.0, at_point[-1], 0.25)]))
+    samples = np.stack([np.interp(wanted, at_point, line[:, axis]) for axis in range(2)])
+    row, column = np.floor(samples).astype(int)
+    row, column = row + np.array([[0], [0], [1], [1]]), column + np.array([[0], [1], [0], [1]])
+    row, column = np.minimum(row, foot.shape[1] - 1), np.minimum(column, foot.shape[2] - 1)
+    return float(np.hypot(*(foot[:, row, column] - samples[:, None])).min()) - 0.5

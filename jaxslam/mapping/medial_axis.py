@@ -1,0 +1,222 @@
+"""Medial axis of the free space of an occupancy grid, by topology-preserving thinning.
+
+The free configurations of a disc-shaped robot (the cells where its centre may be) are thinned from
+the outside in, in the order of their distance to the nearest obstacle. Only simple cells are
+removed, those whose removal changes neither connected components nor holes; so the medial cells
+have the components and the holes of the free configurations by construction. Cells half-way
+between two facing walls are anchors: they are kept, and so dead ends do not shrink away.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+_ROUND = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
+"""Offsets of the eight neighbours of a cell, in circular order; bit k of a pattern is the k-th."""
+
+_EIGHT = np.ones((3, 3), bool)
+
+
+class FreeConfigurations(NamedTuple):
+    """Free configurations of a disc-shaped robot, H x W cells.
+
+    Attributes:
+        distance: (H, W) float64 [cells] distance to the edge of the nearest cell that is not free.
+        nearest_obstacle: (2, H, W) int index of that cell; it may lie one cell beyond the grid.
+        region: (H, W) int connected region of free configurations, 1 for the largest; 0 where the
+            robot does not fit.
+        region_sizes: (K,) int [cells] size of each region, descending.
+    """
+
+    distance: np.ndarray
+    nearest_obstacle: np.ndarray
+    region: np.ndarray
+    region_sizes: np.ndarray
+
+
+def free_space(
+    occupied: np.ndarray, free: np.ndarray, *, min_obstacle_size: float, min_unknown_size: float
+) -> np.ndarray:
+    """Free cells (H, W) bool, with small islands filled.
+
+    Args:
+        occupied: (H, W) bool.
+        free: (H, W) bool; a cell that is neither is unknown.
+        min_obstacle_size: [cells] islands in free space no wider and no higher than this are noise.
+        min_unknown_size: [cells] the same for islands of unknown cells alone, which are no walls.
+    """
+    free = free & ~occupied
+    island, count = ndimage.label(~free, structure=_EIGHT)
+    boxes = ndimage.find_objects(island)
+    has_wall = np.zeros(count + 1, bool)
+    has_wall[np.unique(island[occupied])] = True
+    filled = np.zeros(count + 1, bool)
+    for k, box in enumerate(boxes, start=1):
+        enclosed = all(s.start > 0 and s.stop < n for s, n in zip(box, free.shape, strict=True))
+        width = max(side.stop - side.start for side in box)
+        filled[k] = enclosed and width <= (
+            min_obstacle_size if has_wall[k] else max(min_obstacle_size, min_unknown_size)
+        )
+    return free | filled[island]
+
+
+def free_configurations(free: np.ndarray, *, clearance: float) -> FreeConfigurations:
+    """Regions of free cells in which a disc-shaped robot fits.
+
+    Args:
+        free: (H, W) bool; what lies beyond the grid is not free.
+        clearance: [cells] radius of the robot.
+    """
+    to_centre, foot = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
+    to_edge = to_centre[1:-1, 1:-1] - 0.5
+    region, count = ndimage.label(to_edge >= clearance, structure=_EIGHT)
+    sizes = np.bincount(region.ravel(), minlength=count + 1)[1:]
+    order = np.argsort(-sizes, kind="stable")
+    rank = np.zeros(count + 1, region.dtype)
+    rank[1 + order] = np.arange(1, count + 1)
+    return FreeConfigurations(to_edge, foot[:, 1:-1, 1:-1] - 1, rank[region], sizes[order])
+
+
+def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) -> np.ndarray:
+    """Cells half-way between two obstacles that face each other, the anchors of dead ends.
+
+    Two neighbouring cells whose nearest obstacles f1 and f2 lie far from each other have the medial
+    axis between them. With d the larger of their distances to these, f1 and f2 appear under an
+    angle of at least `angle` if |f1 - f2| >= 2 d sin(angle / 2):
+
+        ### f1 ####################
+             |
+             | d1          d = max(d1, d2)
+            [ ][ ]
+                | d2
+        ####### f2 ################
+
+    Of the two cells the one farther from its obstacle is marked.
+
+    Args:
+        space: Free configurations.
+        wall: (H, W) bool; unknown cells keep the robot out but are no walls, and one of the two
+            obstacles must be a wall.
+        angle: [rad] between the two obstacles, at least.
+
+    Returns:
+        (H, W) bool.
+    """
+    inside = space.region > 0
+    anchors = np.zeros(inside.shape, bool)
+    last_index = np.array(inside.shape)[:, None, None] - 1
+    is_wall = wall[tuple(np.clip(space.nearest_obstacle, 0, last_index))]
+    distance = space.distance + 0.5
+    for low, high in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
+        apart = np.hypot(
+            *(
+                space.nearest_obstacle[(slice(None), *low)]
+                - space.nearest_obstacle[(slice(None), *high)]
+            )
+        )
+        between = apart >= 2 * np.sin(0.5 * angle) * np.maximum(distance[low], distance[high])
+        between &= inside[low] & inside[high] & (is_wall[low] | is_wall[high])
+        high_is_farther = distance[high] > distance[low]
+        anchors[low] |= between & ~high_is_farther
+        anchors[high] |= between & high_is_farther
+    return anchors
+
+
+def medial_cells(space: FreeConfigurations, regions: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Medial cells of some regions of the free configurations, one cell thin.
+
+    Two passes: the first thins down to the anchors and shortens every branch without one; the
+    second thins what is left between clustered anchors and keeps the tips of branches.
+
+    Args:
+        space: Free configurations.
+        regions: (H, W) bool, the cells of the regions.
+        kept: (H, W) bool, anchors: cells that hold dead ends.
+
+    Returns:
+        (H, W) bool.
+    """
+    level = (4.0 * space.distance).astype(np.int64)
+    rough = _thin(regions, level, kept, ends=False)
+    return _thin(rough, level, np.zeros_like(kept), ends=True)
+
+
+def _rules() -> tuple[np.ndarray, np.ndarray]:
+    """For each pattern (256,) of the eight neighbours: is the cell simple, how many are set.
+
+    A cell is simple if its removal changes neither components nor holes: its neighbours hold one
+    component (8-connected) and one component of background (4-connected) that touches it. This is
+    so if its 8-connectivity number is 1. With b_k = 1 for a background neighbour, k in circular
+    order from a side neighbour,
+
+        N = sum over k in {0, 2, 4, 6} of  b_k - b_k b_(k+1) b_(k+2)
+
+          # # #             # # #              # = set
+          . x .   N = 2     . x #   N = 1      left: removing x would join the two sides
+          # # #             . # #              right: x is simple
+
+    References:
+        Yokoi, Toriwaki, Fukumura (1975), An analysis of topological properties of digitized
+        binary pictures using local features.
+    """
+    pattern = np.arange(256)
+    background = [1 - ((pattern >> (k % 8)) & 1) for k in range(9)]
+    number = sum(
+        background[k] - background[k] * background[k + 1] * background[k + 2] for k in (0, 2, 4, 6)
+    )
+    return number == 1, 8 - sum(background[:8])
+
+
+_SIMPLE, _COUNT = _rules()
+
+
+def _thin(cells: np.ndarray, level: np.ndarray, kept: np.ndarray, *, ends: bool) -> np.ndarray:
+    """Remove simple cells, level by level, as long as there are any.
+
+        for each level, ascending:
+            pending = removable cells of this level
+            while pending:
+                for each of the four parity classes, one after the other:
+                    remove all pending cells of the class that are simple
+                pending = remaining removable cells, of this level or lower, beside a removed one
+
+    Cells of one class do not touch, so removing them at once is the same as one by one:
+
+        0 1 0 1
+        2 3 2 3      parity class = 2 (row mod 2) + (column mod 2)
+        0 1 0 1
+
+    Args:
+        cells: (H, W) bool.
+        level: (H, W) int, the order of removal; a cell that is not simple when its level comes is
+            tried again whenever a neighbour has been removed.
+        kept: (H, W) bool, cells that are never removed.
+        ends: Whether a cell with a single neighbour, the tip of a branch, is kept.
+
+    Returns:
+        (H, W) bool.
+    """
+    # Flat indices of a padded grid: neighbours are at constant offsets, and all of them exist.
+    width = cells.shape[1] + 2
+    is_set = np.pad(cells, 1).ravel()
+    removable = is_set & ~np.pad(kept, 1).ravel()
+    level = np.pad(level, 1).ravel()
+    parity = np.add.outer(2 * (np.arange(cells.shape[0] + 2) % 2), np.arange(width) % 2).ravel()
+    offsets = np.array([row * width + column for row, column in _ROUND])
+    bits = 1 << np.arange(8)
+    order = np.flatnonzero(removable)
+    order = order[np.argsort(level[order], kind="stable")]
+    levels, first = np.unique(level[order], return_index=True)
+    for current, pending in zip(levels, np.split(order, first[1:]), strict=True):
+        while pending.size:
+            removed = []
+            for parity_class in range(4):
+                tried = pending[parity[pending] == parity_class]
+                pattern = is_set[tried[:, None] + offsets] @ bits
+                remove = _SIMPLE[pattern] & ~(ends & (_COUNT[pattern] == 1))
+                is_set[tried[remove]] = False
+                removed.append(tried[remove])
+            beside = np.unique(np.concatenate(removed)[:, None] + offsets)
+            pending = beside[is_set[beside] & removable[beside] & (level[beside] <= current)]
+    return is_set.reshape(-1, width)[1:-1, 1:-1]

@@ -1,0 +1,124 @@
+"""The pose graph of a filtered log: measurements with information matrices, estimates as guess."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxslam.core import trace_cache
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.types import WALL, Array
+from jaxslam.filtering.belief import Belief
+from jaxslam.filtering.config import FilterConfig, confirmed
+from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
+from jaxslam.filtering.slam_filter import StepInfo
+from jaxslam.matching.loop_closure import LoopClosures
+
+
+class PoseGraph(NamedTuple):
+    """Poses (T,), landmarks (L,), and the factors between them.
+
+    Attributes:
+        poses: (T, 3) [m, m, rad].
+        landmark_positions: (L, 2) [m] landmark positions.
+        odometry: (T - 1, 3) [m, m, rad] odometry from each pose to the next, in its frame.
+        odometry_information: (T - 1, 3, 3) inverse covariance.
+        pose_index: (K,) index of the pose that a landmark was observed from.
+        landmark_index: (K,) index of the landmark.
+        landmark_xy: (K, 2) [m] observed position, robot frame.
+        landmark_information: (K, 2, 2) inverse covariance.
+        closure_ends: (C, 2) indices of the two poses of a loop closure.
+        closure_pose: (C, 3) [m, m, rad] the second pose in the frame of the first.
+        closure_information: (C, 3, 3) inverse covariance.
+    """
+
+    poses: np.ndarray
+    landmark_positions: np.ndarray
+    odometry: np.ndarray
+    odometry_information: np.ndarray
+    pose_index: np.ndarray
+    landmark_index: np.ndarray
+    landmark_xy: np.ndarray
+    landmark_information: np.ndarray
+    closure_ends: np.ndarray = np.zeros((0, 2), int)
+    closure_pose: np.ndarray = np.zeros((0, 3))
+    closure_information: np.ndarray = np.zeros((0, 3, 3))
+
+
+ODOMETRY_STD_FLOOR = 1e-4  # [m], [rad] std added to each motion: a robot that stands still has none
+
+
+@partial(trace_cache.jit, static_argnames="config")
+def _noise_model(
+    config: FilterConfig, noise: NoiseParams, inputs: Measurement
+) -> tuple[Array, Array, Array]:
+    """Motions (T, 3), their covariances (T, 3, 3), and those of features (T, M, 2, 2)."""
+
+    def of_scan(now: Measurement) -> tuple[Array, Array, Array]:
+        motion, q = motion_estimate(noise, now)
+        return (
+            motion,
+            q,
+            measurement_cov(noise, now.features, untrusted_inflation=config.untrusted_inflation),
+        )
+
+    return jax.vmap(of_scan)(inputs)
+
+
+def build_pose_graph(
+    config: FilterConfig,
+    params: NoiseParams,
+    poses: np.ndarray,
+    belief: Belief,
+    info: StepInfo,
+    measurements: Measurement,
+    loop_closures: LoopClosures | None = None,
+) -> PoseGraph:
+    """Pose graph of a filtered log: measurements with information matrices, estimates as guess.
+
+    Landmarks are the confirmed junctions and corners. Features are measured in polar form (range
+    r, bearing b) with covariance R, and written in Cartesian form (x, y) with covariance J R J^T,
+
+        J = d(x, y) / d(r, b) = [ x / r   -y ]
+                                [ y / r    x ]
+
+    Args:
+        config: Of the filter.
+        params: Noise parameters of the filter.
+        poses: (T, 3) estimated poses of the scans.
+        belief: Of the filter at the end.
+        info: [T] of the filter.
+        measurements: [T] that it was given.
+        loop_closures: Loop closures, if there are any.
+    """
+    kept = np.asarray(confirmed(config, belief) & (belief.kind != WALL))
+    landmark_ids, feature_ids = np.asarray(belief.id)[kept], np.asarray(info.id)
+    scan, feature = np.nonzero(np.isin(feature_ids, landmark_ids) & (feature_ids >= 0))
+    index = {landmark: k for k, landmark in enumerate(landmark_ids.tolist())}
+    motion, q, r = _noise_model(config, params, measurements)
+    q = np.asarray(q, np.float64) + ODOMETRY_STD_FLOOR**2 * np.eye(3)
+    r = np.asarray(r, np.float64)[scan, feature]
+    xy = np.asarray(measurements.features.xy, np.float64)[scan, feature]
+    by_bearing = np.stack([-xy[:, 1], xy[:, 0]], axis=-1)
+    by_range = xy / np.linalg.norm(xy, axis=1, keepdims=True)
+    from_polar = np.stack([by_range, by_bearing], axis=-1)
+    graph = PoseGraph(
+        poses=poses,
+        landmark_positions=np.asarray(belief.landmark_positions, np.float64)[kept],
+        odometry=np.asarray(motion, np.float64)[1:],
+        odometry_information=np.linalg.inv(q[1:]),
+        pose_index=scan,
+        landmark_index=np.array(
+            [index[landmark] for landmark in feature_ids[scan, feature].tolist()], int
+        ),
+        landmark_xy=xy,
+        landmark_information=np.linalg.inv(from_polar @ r @ from_polar.transpose(0, 2, 1)),
+    )
+    if loop_closures is None:
+        return graph
+    return graph._replace(
+        closure_ends=np.stack([loop_closures.first, loop_closures.second], axis=1),
+        closure_pose=loop_closures.relative_pose,
+        closure_information=loop_closures.information,
+    )

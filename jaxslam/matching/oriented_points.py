@@ -1,0 +1,79 @@
+"""TODO."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import dot, rotation, transform
+from jaxslam.core.types import Array
+from jaxslam.frontend.lidar import beam_ends
+
+NORMAL_NEIGHBOURS = 3  # beams on either side that a normal is fitted to
+MAX_NEIGHBOUR_GAP = (0.06, 0.1)  # [m], and fraction of the range: larger gaps separate two surfaces
+MAX_FLATNESS = 0.04  # largest variance across a surface, as a fraction of that along it
+
+
+class OrientedPoints(NamedTuple):
+    """Oriented points: points of a scan with the normals of their surfaces, in some frame.
+
+    Attributes:
+        points: (R, 2) [m] on the line fitted to the point and its neighbours.
+        normal: (R, 2) unit normal of that line, of either sign.
+        neighbour_gap: (R,) [m] to the further of the two adjacent points on the surface.
+        valid: (R,) bool.
+    """
+
+    points: Array
+    normal: Array
+    neighbour_gap: Array
+    valid: Array
+
+
+def oriented_points(lidar: Lidar, scan: Scan) -> OrientedPoints:
+    """Oriented points of one scan, robot frame.
+
+    The line of a point is the least-squares fit to itself and its neighbours up to the first gap.
+
+    Raises:
+        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+    """
+    own = beam_ends(lidar, scan)
+    index = jnp.arange(lidar.num_beams)
+    neighbours, weight, gap = [own], [scan.hit], jnp.zeros(lidar.num_beams)
+    limit = MAX_NEIGHBOUR_GAP[0] + MAX_NEIGHBOUR_GAP[1] * scan.ranges
+    for side in (1, -1):
+        joined, previous = scan.hit, own
+        for k in range(1, NORMAL_NEIGHBOURS + 1):
+            beam = index + side * k
+            inside = (beam >= 0) & (beam < lidar.num_beams)
+            beam = jnp.clip(beam, 0, lidar.num_beams - 1)
+            distance = jnp.linalg.norm(own[beam] - previous, axis=-1)
+            joined = joined & inside & scan.hit[beam] & (distance < limit)
+            previous = own[beam]
+            neighbours.append(previous)
+            weight.append(joined)
+            gap = jnp.where(joined & (k == 1), jnp.maximum(gap, distance), gap)
+    neighbours, weight = jnp.stack(neighbours), jnp.stack(weight).astype(own.dtype)
+    count = jnp.maximum(weight.sum(axis=0), 1.0)
+    centre = jnp.sum(weight[..., None] * neighbours, axis=0) / count[:, None]
+    offset = neighbours - centre[None]
+    xx, xy, yy = (
+        jnp.sum(weight * offset[..., i] * offset[..., j], axis=0) / count
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    # Eigenvalues of the scatter matrix are mean +- spread; the line is along the larger one.
+    direction = 0.5 * jnp.arctan2(2 * xy, xx - yy)
+    normal = jnp.stack([-jnp.sin(direction), jnp.cos(direction)], axis=-1)
+    spread, mean = jnp.hypot(xx - yy, 2 * xy) / 2, (xx + yy) / 2
+    flat = mean - spread < MAX_FLATNESS * (mean + spread)
+    projected = own - dot(own - centre, normal)[:, None] * normal
+    return OrientedPoints(projected, normal, gap, scan.hit & (count >= 3.0) & flat)
+
+
+def transform_points(surfaces: OrientedPoints, pose: Array) -> OrientedPoints:
+    """Oriented points of the frame of a pose (3,), in the frame that the pose is given in."""
+    turn = rotation(pose[2])
+    return surfaces._replace(
+        points=transform(pose, surfaces.points), normal=surfaces.normal @ turn.T
+    )

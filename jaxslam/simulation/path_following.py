@@ -1,0 +1,108 @@
+"""A path followed by pure pursuit."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.se2 import inverse_transform, range_bearing
+from jaxslam.core.types import Array
+from jaxslam.simulation.robot import arc_increment
+
+SEARCH_WINDOW = 40  # points of the path ahead of the robot that are searched
+TURN_ON_SPOT_ANGLE = (
+    0.6  # [rad] the robot turns on the spot to a target at a larger bearing than this
+)
+GOAL_TOLERANCE = 0.05  # [m] the robot stops this close to the end of the path
+
+
+def densify(waypoints: np.ndarray, spacing: float = 0.05) -> np.ndarray:
+    """Points (N, 2) about `spacing` [m] apart on the straight lines that join waypoints (K, 2) [m].
+
+    The waypoints are among them.
+
+    Raises:
+        ValueError: The waypoints have another shape.
+    """
+    if np.ndim(waypoints) != 2 or len(waypoints) < 1 or np.shape(waypoints)[1] != 2:
+        raise ValueError(f"waypoints is {np.shape(waypoints)}, not (K >= 1, 2)")
+    legs = np.hypot(*np.diff(waypoints, axis=0).T)
+    at_waypoint = np.concatenate([[0.0], np.cumsum(legs)])
+    wanted = np.linspace(0.0, at_waypoint[-1], round(at_waypoint[-1] / spacing) + 1)
+    wanted = np.unique(np.concatenate([wanted, at_waypoint]))
+    return np.stack([np.interp(wanted, at_waypoint, waypoints[:, k]) for k in range(2)], axis=1)
+
+
+def pure_pursuit(
+    path: Array,
+    index: Array,
+    pose: Array,
+    *,
+    lookahead: float = 0.5,
+    max_step: float = 0.3,
+    max_turn: float = 0.2,
+) -> tuple[Array, Array]:
+    """Motion to make between two scans to follow a path by pure pursuit.
+
+    The circle that starts ahead and leads to a target at distance r and bearing a has the
+    curvature 2 sin(a) / r, and its part up to the target the length r a / sin(a):
+
+               o target           The target is the first point of the path `lookahead` further
+             /  |                 along than the point nearest to the robot. A target at a bearing
+          r / a ' circle          of more than `TURN_ON_SPOT_ANGLE` is first turned to on the spot.
+           /   .
+          robot -> ahead
+
+    Args:
+        path: (N, 2) points of the path [m, map frame]; `SEARCH_WINDOW` of them must span the lookahead.
+        index: () int32 index of the path point that was nearest at the last call, 0 at the first.
+        pose: (3,) [m, m, rad] of the robot, map frame.
+        lookahead: [m] distance along the path from the nearest path point to the target.
+        max_step: [m] largest length of the motion.
+        max_turn: [rad] largest change of heading of the motion.
+
+    Returns:
+        Motion (3,) [m, m, rad] in the frame of the robot, zero at the end of the path, and the
+        index () int32 of the nearest path point.
+
+    Raises:
+        ValueError: The path or the pose has another shape; while tracing.
+
+    References:
+        Coulter (1992), Implementation of the pure pursuit path tracking algorithm.
+    """
+    if path.ndim != 2 or path.shape[1] != 2:
+        raise ValueError(f"path is {path.shape}, not (N, 2)")
+    if pose.shape != (3,):
+        raise ValueError(f"pose is {pose.shape}, not (3,)")
+    nearest, target = _nearest_and_target(path, index, pose, lookahead)
+    distance, bearing = range_bearing(inverse_transform(pose, path[target]))
+
+    limited = jnp.clip(bearing, -TURN_ON_SPOT_ANGLE, TURN_ON_SPOT_ANGLE)
+    curvature = 2 * jnp.sin(limited) / jnp.maximum(distance, GOAL_TOLERANCE)
+    length = jnp.minimum(max_step, distance / jnp.sinc(limited / jnp.pi))
+    length = jnp.minimum(length, max_turn / jnp.maximum(jnp.abs(curvature), max_turn / max_step))
+
+    on_the_spot = jnp.abs(bearing) > TURN_ON_SPOT_ANGLE
+    done = (target == path.shape[0] - 1) & (distance < GOAL_TOLERANCE)
+    length = jnp.where(done | on_the_spot, 0.0, length)
+    rotation = jnp.where(on_the_spot, jnp.clip(bearing, -max_turn, max_turn), length * curvature)
+    return arc_increment(length, jnp.where(done, 0.0, rotation)), nearest
+
+
+def _nearest_and_target(
+    path: Array, previous: Array, pose: Array, lookahead: float
+) -> tuple[Array, Array]:
+    """Indices () of the path point nearest to the robot, and of the first `lookahead` [m] on.
+
+    Both are searched in a window of `SEARCH_WINDOW` points, so that a path that crosses itself is followed
+    in order.
+    """
+    last = path.shape[0] - 1
+    index = jnp.minimum(previous + jnp.arange(SEARCH_WINDOW, dtype=previous.dtype), last)
+    offset = path[index] - pose[None, :2]
+    nearest = index[jnp.argmin(jnp.sum(offset**2, axis=1))]
+
+    index = jnp.minimum(nearest + jnp.arange(SEARCH_WINDOW, dtype=previous.dtype), last)
+    step = jnp.diff(path[index], axis=0)
+    along_path = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
+    ahead = jnp.minimum(jnp.sum(along_path < lookahead) + 1, SEARCH_WINDOW - 1)
+    return nearest, index[ahead]

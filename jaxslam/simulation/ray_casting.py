@@ -1,0 +1,48 @@
+"""Ray casting of a laser scanner in a world of straight walls, and range noise."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import cross, unit_vector
+from jaxslam.core.types import Array, Key, check_array
+from jaxslam.frontend.lidar import beam_angles, to_scan
+from jaxslam.simulation.worlds import World
+
+SEAM = 1e-5  # fraction of its length by which a wall is lengthened at either end
+
+
+def cast(lidar: Lidar, world: World, pose: Array) -> Scan:
+    """Noise-free scan of `worlds` from `pose` (3,).
+
+    A beam along unit vector u from p meets the wall a + s (b - a), 0 <= s <= 1, at the distance
+    t = (a - p) x (b - a) / (u x (b - a)). Walls are lengthened by `SEAM`, so that no beam passes
+    between two that share a corner.
+
+    Args:
+        world: The walls.
+        pose: (3,) [m, m, rad] of the lidar in the world.
+        lidar: The scanner.
+
+    Raises:
+        ValueError: Walls or pose have another shape or type; while tracing.
+    """
+    check_array("world.walls", world.walls, ("S", 4), jnp.floating)
+    check_array("pose", pose, (3,), jnp.floating)
+    beam = unit_vector(pose[2] + beam_angles(lidar))[:, None, :]  # (R, 1, 2)
+    start = (world.walls[:, :2] - pose[None, :2])[None]  # (1, S, 2)
+    along = (world.walls[:, 2:] - world.walls[:, :2])[None]  # (1, S, 2)
+    slope = cross(beam, along)  # (R, S)
+    crosses = jnp.abs(slope) > 1e-9
+    safe = jnp.where(crosses, slope, 1.0)
+    distance = cross(start, along) / safe  # t
+    fraction = cross(start, beam) / safe  # s
+    met = crosses & (distance > 1e-6) & (jnp.abs(fraction - 0.5) <= 0.5 + SEAM)
+    ranges = jnp.min(jnp.where(met, distance, jnp.inf), axis=1)
+    return to_scan(lidar, ranges)
+
+
+def add_range_noise(key: Key, lidar: Lidar, scan: Scan) -> Scan:
+    """Add the range noise of the lidar to a scan; ranges beyond the largest become no return."""
+    noise = lidar.range_std * jax.random.normal(key, scan.ranges.shape, scan.ranges.dtype)
+    return to_scan(lidar, jnp.where(scan.hit, scan.ranges + noise, jnp.inf))

@@ -1,0 +1,123 @@
+"""Losses for tuning Q and R by gradient: each is evaluated on one drive.
+
+A loss takes the step infos [T] of the filter and its log, and returns a number (). `fitting.tune`
+takes any function that does so; these are the usual ones.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.episode import Episode
+from jaxslam.core.linalg import inverse_cholesky
+from jaxslam.core.types import Array
+from jaxslam.evaluation.consistency import CERTAIN_TRACE, pose_error
+from jaxslam.filtering.slam_filter import StepInfo
+
+Loss = Callable[[StepInfo, Episode], Array]
+
+HEADING_WEIGHT = (
+    1.0  # [m^2 / rad^2] weight of a squared heading error, relative to a squared position
+)
+
+
+def pose_mse(info: StepInfo, episode: Episode) -> Array:
+    """Mean squared position error [m^2] plus `HEADING_WEIGHT` times squared heading error; needs truth.
+
+    A common factor on all of Q and R leaves the filter's gains unchanged: this loss determines
+    the ratios of the noise parameters, not their scale.
+    """
+    error = pose_error(info.pose, episode.truth)
+    square = jnp.sum(error[:, :2] ** 2, axis=1) + HEADING_WEIGHT * error[:, 2] ** 2
+    return _mean(square, _truth_mask(episode))
+
+
+def innovation_nll(info: StepInfo, episode: Episode) -> Array:
+    """Negative log-likelihood [nats] of the innovations, per scalar measurement; no truth needed.
+
+    Data association decides which measurements enter: values under different associations are not
+    comparable.
+    """
+    count = jnp.maximum(jnp.sum(info.dof), 1).astype(info.nis.dtype)
+    return -jnp.sum(info.log_likelihood) / count
+
+
+def pose_nll(info: StepInfo, episode: Episode) -> Array:
+    """Negative log-density [nats] of the true pose under the estimate, mean over scans.
+
+        (e^T P^-1 e + log det P) / 2
+
+    without the constant. It needs truth. If only the scale of P is free, it is least where NEES
+    has its expected value; among filters with that NEES it is least for the smallest det P, and
+    so for the smallest errors. It rewards accuracy and consistency together.
+
+    References:
+        Gneiting, Raftery (2007), "Strictly proper scoring rules": the logarithmic score.
+    """
+    error = pose_error(info.pose, episode.truth)
+    uncertain = jnp.trace(info.pose_cov, axis1=1, axis2=2) > CERTAIN_TRACE
+    eye = jnp.eye(3, dtype=error.dtype)
+    safe = jnp.where(uncertain[:, None, None], info.pose_cov, eye)
+    root, logdet, good = jax.vmap(inverse_cholesky)(safe)
+    square = jnp.sum(jnp.einsum("tij,tj->ti", root, error) ** 2, axis=1)
+    return _mean((square + logdet) / 2, _truth_mask(episode) & uncertain & good)
+
+
+class WeightedLoss(NamedTuple):
+    """A weighted sum of losses; itself a loss.
+
+    Attributes:
+        terms: Weight and loss of each term.
+    """
+
+    terms: tuple[tuple[float, Loss], ...]
+
+    def __call__(self, info: StepInfo, log: Episode) -> Array:
+        """The weighted sum ()."""
+        return sum(weight * loss(info, log) for weight, loss in self.terms)
+
+
+BY_NAME = {f.__name__: f for f in (pose_mse, innovation_nll, pose_nll)}
+
+
+def needs_truth(loss: Loss) -> bool:
+    """Whether a loss of this module, or a sum of them, needs ground truth."""
+    if isinstance(loss, WeightedLoss):
+        return any(needs_truth(term) for _, term in loss.terms)
+    return loss in (pose_mse, pose_nll)
+
+
+def check_loss(loss: Loss, episodes: Episode, *, name: str = "logs") -> None:
+    """Check, before any work starts, that a loss can be evaluated on logs [B].
+
+    Args:
+        loss: The loss.
+        episodes: [B] drives.
+        name: What the logs are called in the error message.
+
+    Raises:
+        ValueError: There are no logs, or one has no ground truth and the loss needs it.
+    """
+    if not episodes.odometry.shape[0]:
+        raise ValueError(f"{name}: no runs to tune on")
+    if needs_truth(loss) and episodes.truth_mask is not None:
+        missing = np.flatnonzero(~np.asarray(episodes.truth_mask).any(axis=1))
+        if missing.size:
+            raise ValueError(
+                f"{name}: run {missing[0]} has no reference, which this loss needs; "
+                "give one, or use the likelihood"
+            )
+
+
+def _truth_mask(log: Episode) -> Array:
+    """Scans (T,) bool with ground truth."""
+    return jnp.ones(len(log.truth), bool) if log.truth_mask is None else log.truth_mask
+
+
+def _mean(values: Array, mask: Array) -> Array:
+    """Mean () of the values (T,) whose mask is True; 0 if there are none."""
+    count = jnp.maximum(jnp.sum(mask), 1).astype(values.dtype)
+    return jnp.sum(jnp.where(mask, values, 0.0)) / count

@@ -1,0 +1,116 @@
+"""Optimisers for a loss that is evaluated together with its gradient, with optax's interface.
+
+Where each step evaluates the same data, the losses of two steps are comparable: L-BFGS with
+backtracking, which follows the narrow valleys between strongly correlated parameters. With
+minibatches losses are not comparable: Adam.
+
+The usual line search (`optax.lbfgs`) evaluates the loss several times per step inside `update`.
+Here every evaluation runs the filter on all data, by a program of its own, so `lbfgs_backtracking` does one
+evaluation per `update` and spreads the line search over several of them.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxslam.core.types import Array
+
+LBFGS_MEMORY = 10  # pairs of steps and gradient differences that L-BFGS stores
+MAX_CHANGE = 0.4  # largest change of a parameter in one step
+ADAM_RATE = 0.2  # initial learning rate of Adam
+
+
+class BacktrackState(NamedTuple):
+    """State of `lbfgs_backtracking`: F parameters.
+
+    Attributes:
+        inner: State of L-BFGS at the best point.
+        value: () loss at the best point, the least so far.
+        theta: (F,) the best point.
+        direction: (F,) search direction from there.
+        max_change: () largest change of a parameter in the next step.
+    """
+
+    inner: Any
+    value: Array
+    theta: Array
+    direction: Array
+    max_change: Array
+
+
+@cache
+def default_optimizer(num_updates: int, *, whole: bool) -> optax.GradientTransformationExtraArgs:
+    """The default optimiser.
+
+    Args:
+        num_updates: Number of updates, over which Adam's learning rate decays to a tenth (cosine).
+        whole: Whether each step evaluates all data.
+
+    Returns:
+        `lbfgs_backtracking` if so, else Adam.
+    """
+    if whole:
+        return lbfgs_backtracking()
+    rate = optax.cosine_decay_schedule(ADAM_RATE, max(num_updates, 1), alpha=0.1)
+    return optax.with_extra_args_support(optax.adam(rate))
+
+
+@cache
+def lbfgs_backtracking() -> optax.GradientTransformationExtraArgs:
+    """L-BFGS with backtracking to the best point; its `update` needs the `value` of the loss.
+
+    The caller evaluates loss f and gradient g at a trial point x and calls `update(g, state, x,
+    value=f)`, which returns the step from x to the next trial point. The state is the best point
+    x*, with its loss f*, a search direction d from it and a bound r on the change of any parameter:
+
+        start:  f* = inf, x* = x, d = 0, r = REACH
+
+        f < f*, accepted:                         f >= f* or NaN, rejected:
+            x*, f* <- x, f                            x*, f*, d and L-BFGS stay as they are
+            d <- L-BFGS direction from g              r <- min(r, max|d|) / 4
+            r <- min(2 r, REACH)                           (a quarter of the step that failed)
+
+        in both cases the next trial point is  x* + d min(1, r / max|d|)
+
+    A direction of L-BFGS that does not descend (g . d >= 0) is replaced by the negative gradient,
+    scaled to a largest change of REACH. The first evaluation is always accepted if it is finite.
+    """
+    lbfgs = optax.scale_by_lbfgs(memory_size=LBFGS_MEMORY)
+
+    def init(theta: Array) -> BacktrackState:
+        reach = jnp.full((), MAX_CHANGE, theta.dtype)
+        value = jnp.full((), jnp.inf, theta.dtype)
+        return BacktrackState(lbfgs.init(theta), value, theta, jnp.zeros_like(theta), reach)
+
+    def accept(
+        gradient: Array, state: BacktrackState, theta: Array, value: Array
+    ) -> BacktrackState:
+        scaled, inner = lbfgs.update(gradient, state.inner, theta)
+        steepest = -gradient * (MAX_CHANGE / _or_one(jnp.max(jnp.abs(gradient))))
+        direction = jnp.where(jnp.vdot(scaled, gradient) > 0.0, -scaled, steepest)
+        reach = jnp.minimum(2.0 * state.max_change, MAX_CHANGE)
+        return BacktrackState(inner, value.astype(theta.dtype), theta, direction, reach)
+
+    def reject(state: BacktrackState) -> BacktrackState:
+        failed = jnp.minimum(state.max_change, jnp.max(jnp.abs(state.direction)))
+        return state._replace(max_change=failed / 4.0)
+
+    def update(
+        gradient: Array, state: BacktrackState, theta: Array, *, value: Array, **extra_args: Any
+    ) -> tuple[Array, BacktrackState]:
+        del extra_args  # optax passes them to all transformations of a chain
+        better = value < state.value
+        choices = accept(gradient, state, theta, value), reject(state)
+        state = jax.tree.map(lambda x, y: jnp.where(better, x, y), *choices)
+        fraction = jnp.minimum(1.0, state.max_change / _or_one(jnp.max(jnp.abs(state.direction))))
+        return state.theta + fraction * state.direction - theta, state
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def _or_one(x: Array) -> Array:
+    """`x` where it is positive, else 1, to divide by."""
+    return jnp.where(x > 0.0, x, 1.0)

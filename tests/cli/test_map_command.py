@@ -1,0 +1,177 @@
+import json
+import sys
+from pathlib import Path
+
+import networkx
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxslam.cli import main, report
+from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.io import graphml
+from jaxslam.viz import canvas, maps
+
+FILES = {"metrics.json", "map.geojson", "map.graphml", "map.png"}
+YAML = "image: a.pgm\nresolution: 0.1\norigin: [-2.0, 1.0, 0.0]\nnegate: 0\n"
+YAML += "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "maps"
+
+
+def write_map(folder, free=None):
+    """A ring of corridors with a dead end, 9 m x 7 m; image rows go down."""
+    if free is None:
+        free = np.zeros((70, 90), bool)
+        free[5:65, 5:60] = True
+        free[16:54, 16:49] = False
+        free[30:41, 60:85] = True
+    Image.fromarray(np.where(free, 254, 0).astype(np.uint8)[::-1]).save(folder / "a.pgm")
+    (folder / "a.yaml").write_text(YAML)
+    return folder / "a.yaml"
+
+
+@pytest.fixture
+def done(tmp_path, capsys):
+    assert main.main(["map", str(write_map(tmp_path)), "--out", str(tmp_path / "out")]) == 0
+    return tmp_path / "out", *capsys.readouterr()
+
+
+def test_map_writes_its_files_and_nothing_else(done):
+    out, said, errors = done
+    assert {file.name for file in out.iterdir()} == FILES
+    assert {file.name for file in out.parent.iterdir()} == {"out", "a.pgm", "a.yaml"}
+    assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
+    assert "dead ends" in said and str(out) in said and len(said.splitlines()) < 14
+    assert all("/4 [" in line for line in errors.split("\r") if line)  # a bar at most
+
+
+def test_map_counts_what_it_found(done):
+    numbers = json.loads((done[0] / "metrics.json").read_text())
+    expected = {"nodes": 2, "arcs": 2, "dead_ends": 1, "rings": 1, "regions": 1}
+    assert expected.items() <= numbers.items()
+    assert numbers["length_m"] == pytest.approx(2 * 4.9 + 2 * 4.4 + 2.5 - 1.0, abs=0.5)
+    assert 0.4 < numbers["narrowest_m"] < 0.6 and numbers["clearance_m"] == 0.25
+    assert 0.0 < numbers["reached_m2"] < 30.0 and numbers["left_out_m2"] == 0.0
+    assert numbers["seconds"]["run"] > 0.0
+
+
+def test_files_hold_one_graph_in_the_frame_of_the_map(done):
+    net = networkx.read_graphml(done[0] / "map.graphml", node_type=int, force_multigraph=True)
+    features = json.loads((done[0] / "map.geojson").read_text())["features"]
+    points = {
+        f["properties"]["id"]: f["geometry"]["coordinates"]
+        for f in features
+        if f["geometry"]["type"] == "Point"
+    }
+    assert points == {id: [node["x"], node["y"]] for id, node in net.nodes(data=True)}
+    roads = [f for f in features if f["geometry"]["type"] == "MultiLineString"]
+    assert len(roads) == 2 * len(net.edges) == 4
+    assert networkx.is_connected(net) and sorted(dict(net.degree).values()) == [1, 3]
+    (tip,) = (id for id, degree in net.degree if degree == 1)
+    np.testing.assert_allclose(points[tip], [-2.0 + 8.0, 1.0 + 3.55], atol=0.3)
+
+
+def graph_of_two():
+    """Two nodes, three arcs: two between them and a loop, one clearance not known."""
+    xy = np.array([[0.0, 0.0], [4.0, 1.0]])
+    lines = (np.array([xy[0], [2.0, 3.0], xy[1]]), xy[::-1].copy(), xy[[0, 1, 0]])
+    return TopologicalMap(
+        id=np.array([3, 8]),
+        xy=xy,
+        kind=np.zeros(2, int),
+        clearance=np.array([1.0, 0.5]),
+        arc_ends=np.array([[0, 1], [1, 0], [0, 0]]),
+        arc_length=np.array([5.5, 4.1, 8.2]),
+        arc_clearance=np.array([0.4, np.nan, 0.3]),
+        arc_lines=lines,
+    )
+
+
+def test_graphml_keeps_parallel_arcs_loops_and_lines(tmp_path):
+    graph = graph_of_two()
+    graphml.write(tmp_path / "map.graphml", graph)
+    net = networkx.read_graphml(tmp_path / "map.graphml", node_type=int)
+    assert net.is_multigraph() and not net.is_directed()
+    assert sorted(net.edges()) == [(3, 3), (3, 8), (3, 8)]
+    found = sorted((data["length"], data.get("clearance")) for *_, data in net.edges(data=True))
+    assert found == [(4.1, None), (5.5, 0.4), (8.2, 0.3)]
+    lines = {data["length"]: data["line"] for *_, data in net.edges(data=True)}
+    assert lines[5.5] == "LINESTRING (0.0 0.0, 2.0 3.0, 4.0 1.0)"
+
+
+def test_the_picture_shows_the_map_where_it_is():
+    free = np.ones((20, 10), bool)
+    map = OccupancyMap(~free, free, 0.5, np.array([1.0, 2.0, np.pi / 2]))
+    corners = maps.known_corners(map)
+    np.testing.assert_allclose(corners, [[1, 2], [1, 12], [-4, 12], [-4, 2]], atol=1e-12)
+    axis = canvas.map_canvas(*canvas.extent(corners))[1]
+    maps.draw_occupancy(axis, map)
+    maps.draw_topological_map(axis, graph_of_two())
+    (image,) = axis.images
+    shown = image.get_transform() - axis.transData
+    np.testing.assert_allclose(shown.transform((20, 10)), [-4.0, 12.0], atol=1e-9)
+    assert len(axis.collections[0].get_segments()) == 3
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Function that runs bad arguments, checks how they are refused, and returns the line."""
+
+    def refuse(*arguments):
+        before = sorted(tmp_path.rglob("*"))
+        out = tmp_path / "results"
+        assert main.main(["map", *map(str, arguments), "--out", str(out)]) == 2
+        line = capsys.readouterr().err
+        assert line.startswith("jaxslam: error: ") and line.count("\n") == 1
+        assert sorted(tmp_path.rglob("*")) == before
+        return line
+
+    return refuse
+
+
+def test_map_refuses_what_is_no_map(refused, tmp_path):
+    assert "missing.yaml: does not exist" in refused(tmp_path / "missing.yaml")
+    path = write_map(tmp_path)
+    path.write_text(YAML.replace("0.1", "-0.1"))
+    assert "a.yaml: resolution: -0.1" in refused(path)
+    path.write_text(YAML)
+    (tmp_path / "a.pgm").unlink()
+    assert "a.pgm: does not exist" in refused(path)
+
+
+def test_map_refuses_a_map_without_free_space(refused, tmp_path):
+    assert "a.yaml: has no free space" in refused(write_map(tmp_path, np.zeros((9, 9), bool)))
+    assert "5 m" in refused(write_map(tmp_path), "--clearance", 5.0)
+
+
+@pytest.mark.parametrize("option", ["--clearance", "--speck"])
+@pytest.mark.parametrize("value", [-1, "nan", "inf"])
+def test_map_refuses_bad_options(refused, tmp_path, option, value):
+    assert option in refused(write_map(tmp_path), option, value)
+
+
+@pytest.mark.parametrize("module, extra", [("networkx", "graph"), ("yaml", "ros")])
+def test_map_says_which_extra_is_missing(refused, tmp_path, monkeypatch, module, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert f"jaxslam[{extra}]" in refused(write_map(tmp_path))
+
+
+def test_an_interrupt_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "draw_map", stop)
+    assert main.main(["map", str(write_map(tmp_path)), "--out", str(tmp_path / "out")]) == 130
+    assert {file.name for file in tmp_path.iterdir()} == {"a.pgm", "a.yaml"}
+
+
+@pytest.mark.parametrize("name, rings", [("willow-full", 30), ("intel", 8), ("aces", 4)])
+def test_recorded_maps_become_one_connected_graph(tmp_path, name, rings):
+    path = MAPS / f"{name}.yaml"
+    if not path.is_file():
+        pytest.skip("no recorded maps in ../shared/data/maps beside the repository")
+    assert main.main(["map", str(path), "--out", str(tmp_path)]) == 0
+    net = networkx.read_graphml(tmp_path / "map.graphml", force_multigraph=True)
+    numbers = json.loads((tmp_path / "metrics.json").read_text())
+    assert networkx.is_connected(net) and numbers["rings"] > rings
+    assert numbers["reached_m2"] > 50 * numbers["left_out_m2"]

@@ -1,0 +1,103 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam.core import se2
+
+SEEDS = range(5)
+
+
+def poses(seed):
+    """Three poses (3, 3) up to some metres from the origin, with any heading."""
+    return jax.random.uniform(jax.random.key(seed), (3, 3), minval=-3.1, maxval=3.1)
+
+
+def matrix(pose):
+    """Homogeneous matrix (3, 3) of a pose."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([[c, -s, pose[0]], [s, c, pose[1]], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_compose_multiplies_matrices(seed):
+    a, b, _ = poses(seed)
+    np.testing.assert_allclose(matrix(se2.compose(a, b)), matrix(a) @ matrix(b), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_compose_is_a_group(seed):
+    a, b, c = poses(seed)
+    zero = jnp.zeros(3)
+    left, right = se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c))
+    np.testing.assert_allclose(se2.relative(left, right), zero, atol=1e-12)
+    np.testing.assert_allclose(se2.compose(a, zero), a, atol=1e-12)
+    np.testing.assert_allclose(se2.compose(zero, a), a, atol=1e-12)
+    np.testing.assert_allclose(se2.compose(a, se2.relative(a, zero)), zero, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_between_undoes_compose(seed):
+    a, b, _ = poses(seed)
+    np.testing.assert_allclose(se2.compose(a, se2.relative(a, b)), b, atol=1e-12)
+    np.testing.assert_allclose(se2.relative(a, se2.compose(a, b)), b, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_to_robot_undoes_to_world(seed):
+    pose = poses(seed)[0]
+    points = jax.random.normal(jax.random.key(seed + 100), (4, 7, 2))
+    there = se2.transform(pose, points)
+    np.testing.assert_allclose(se2.inverse_transform(pose, there), points, atol=1e-12)
+    np.testing.assert_allclose(there[2, 3], (matrix(pose) @ [*points[2, 3], 1])[:2], atol=1e-12)
+    turned = se2.rotation(pose[2]) @ points[2, 3] + pose[:2]
+    np.testing.assert_allclose(there[2, 3], turned, atol=1e-12)
+
+
+def test_wrap_angle_keeps_the_direction_and_the_slope():
+    angles = jnp.linspace(-20, 20, 401)
+    wrapped = se2.wrap_angle(angles)
+    assert np.all((wrapped >= -np.pi) & (wrapped < np.pi))
+    np.testing.assert_allclose(se2.unit_vector(wrapped), se2.unit_vector(angles), atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(jax.grad(se2.wrap_angle))(angles), 1.0)
+
+
+def test_wrap_line_keeps_the_line():
+    angles = jnp.linspace(-20, 20, 401)
+    wrapped = se2.wrap_direction(angles)
+    assert np.all((wrapped >= -np.pi / 2) & (wrapped < np.pi / 2))
+    np.testing.assert_allclose(
+        se2.unit_vector(2 * wrapped), se2.unit_vector(2 * angles), atol=1e-12
+    )
+    np.testing.assert_allclose(se2.wrap_direction(angles + jnp.pi), wrapped, atol=1e-12)
+
+
+def test_range_bearing_is_polar_form():
+    offset = jnp.array([-1.0, 1.0])
+    np.testing.assert_allclose(se2.range_bearing(offset), [np.sqrt(2), 3 * np.pi / 4])
+
+
+def test_gradients_are_finite_at_the_origin():
+    zero = jnp.zeros(3)
+    np.testing.assert_array_equal(se2.range_bearing(jnp.zeros(2)), jnp.zeros(2))
+    for derivative in (
+        jax.jacrev(se2.range_bearing)(jnp.zeros(2)),
+        jax.jacfwd(se2.range_bearing)(jnp.zeros(2)),
+        jax.jacrev(se2.compose, argnums=(0, 1))(zero, zero),
+        jax.jacrev(se2.relative, argnums=(0, 1))(zero, zero),
+    ):
+        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative))
+
+
+def test_cross_and_dot_are_sine_and_cosine():
+    a, b = jnp.array([0.3, 1.1]), jnp.array([[2.0, -0.4], [0.5, 0.5]])
+    np.testing.assert_allclose(
+        se2.cross(se2.unit_vector(a), se2.unit_vector(a + b[0])), jnp.sin(b[0]), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        se2.dot(se2.unit_vector(a), se2.unit_vector(a + b[0])), jnp.cos(b[0]), atol=1e-12
+    )
+
+
+def test_wrapped_zero_keeps_float32():
+    assert se2.compose(jnp.zeros(3, jnp.float32), jnp.ones(3, jnp.float32)).dtype == jnp.float32

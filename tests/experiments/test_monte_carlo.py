@@ -1,0 +1,350 @@
+"""The experiment of many drives: on several processes, and stopped and gone on with."""
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+from io import StringIO
+from time import monotonic, sleep
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import estimator, monte_carlo, processes, scaling
+from jaxslam.core.scan import Lidar
+from jaxslam.core.types import CORNER, WALL
+from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.grid import GridSpec
+from jaxslam.io.errors import InputError
+from jaxslam.io.output import plain
+from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.episodes import TrialResult
+from jaxslam.simulation import worlds
+from jaxslam.simulation.path_following import densify
+from jaxslam.simulation.robot import Robot
+
+CONFIG = Config.for_lidar(
+    Lidar(num_beams=91, angle_increment=np.pi / 90),
+    frontend=FrontendConfig(
+        grid=GridSpec(x_max=4.0, y_half=3.0),
+    ),
+    filter=FilterConfig(
+        max_landmarks=16,
+        max_updates=4,
+        landmark_kinds=(CORNER, WALL),
+    ),
+)
+CASE = monte_carlo.Case(
+    seed=5,
+    config=CONFIG,
+    robot=Robot(),
+    walls=np.asarray(worlds.named("fig07").walls),
+    path=densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
+    steps=4,
+)
+RUNS = 10
+TIMED = {"seconds", "seconds_per_scan", "peak_mb", "processes", "devices"}
+
+
+def told(numbers):
+    """What does not depend on where and when it was found."""
+    return json.loads(json.dumps(plain(numbers) | dict.fromkeys(TIMED)))
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The numbers of one process, and the folder where it has kept its runs."""
+    folder = tmp_path_factory.mktemp("one") / "runs"
+    return monte_carlo.work(CASE, RUNS, folder, StringIO()), folder
+
+
+def hello(text, say):
+    """Work that needs no compiler."""
+    import jax
+
+    say.write(f"this is process {jax.process_index()}\n")
+    return f"{text} {jax.process_index()} of {jax.process_count()}"
+
+
+def die(who, how, say):
+    """Work at which process `who` ends early, and the others wait for it."""
+    import jax
+    from jax.experimental import multihost_utils
+
+    if jax.process_index() == who:
+        if how == "refuse":
+            raise InputError("is bad", field="--this")
+        if how == "raise":
+            raise ValueError("nothing to\nsee")
+        os.kill(os.getpid(), signal.SIGKILL)
+    multihost_utils.process_allgather(np.ones(2))
+
+
+def left_over(pid):
+    """Processes that process `pid` has started."""
+    line = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return line.stdout.split()
+
+
+@pytest.mark.timeout(300)
+def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
+    flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    numbers = monte_carlo.compute(CASE, RUNS, tmp_path / "runs", processes.local(2))
+    assert numbers["processes"] == numbers["devices"] == 2
+    assert told(numbers) == told(done[0])
+    (one,), (two,) = ([*folder.glob("*.npz")] for folder in (done[1], tmp_path / "runs"))
+    with np.load(one) as one, np.load(two) as two:
+        for name in monte_carlo.Track._fields:
+            np.testing.assert_array_equal(one[name], two[name])
+
+
+@pytest.mark.timeout(120)
+def test_each_process_returns_what_it_found(capfd):
+    assert processes.run(processes.local(2), hello, "I am") == ["I am 0 of 2", "I am 1 of 2"]
+    assert capfd.readouterr().err == "this is process 0\n"
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(
+    "who, how, kind, line",
+    [
+        (1, "kill", processes.Lost, "process 1 of 2 ended early (exit code -9)"),
+        (0, "kill", processes.Lost, "process 0 of 2 ended early (exit code -9)"),
+        (1, "raise", processes.Lost, "process 1 of 2 ended early (ValueError: nothing to)"),
+        (0, "refuse", InputError, "--this: is bad"),
+    ],
+)
+def test_a_process_that_ends_early_ends_all(who, how, kind, line, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    begin = monotonic()
+    with pytest.raises(kind, match=re.escape(line)):
+        processes.run(processes.local(2), die, who, how)
+    assert monotonic() - begin < 60
+    assert not multiprocessing.active_children()
+    assert any(tmp_path.iterdir()) is (kind is processes.Lost)  # what it printed
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_process_that_is_missing_is_told_in_one_line(number, tmp_path):
+    """The command itself: the other one of two machines is never started."""
+    port = processes.local(2).address.split(":")[1]
+    code = "import sys; from experiments import monte_carlo, processes; processes.WAIT = 6.0; "
+    code += "sys.exit(monte_carlo.main(sys.argv[1:]))"
+    options = ["--coordinator_address", f"127.0.0.1:{port}", "--num_processes", "2"]
+    options += ["--process_id", str(number), "--runs", "8", "--out", str(tmp_path)]
+    begin = monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", code, *options], capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 2 and monotonic() - begin < 60
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("monte_carlo: error: not all of 2 processes came up at 127.0.0.1")
+
+
+@pytest.mark.timeout(120)
+def test_no_process_outlives_the_one_that_started_it(tmp_path):
+    code = "from experiments import processes; from tests import test_many; "
+    code += "processes.run(processes.local(2), test_many.idle)"
+    own = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    parent = subprocess.Popen([sys.executable, "-c", code], env=own, stderr=subprocess.PIPE)
+    try:
+        assert parent.stderr.readline() == b"idle\n"
+        started = left_over(parent.pid)
+        assert len(started) >= 2
+    finally:
+        parent.kill()
+        parent.communicate()
+    end = monotonic() + 20
+    while monotonic() < end and any(os.path.exists(f"/proc/{pid}/exe") for pid in started):
+        sleep(0.1)
+    assert not [pid for pid in started if os.path.exists(f"/proc/{pid}/exe")]
+
+
+def idle(say):
+    """Work that does not end."""
+    say.write("idle\n")
+    say.flush()
+    sleep(600)
+
+
+@pytest.mark.parametrize(
+    "options, field",
+    [
+        (["--runs", "0"], "--runs"),
+        (["--process_id", "1"], "--coordinator_address"),
+        (["--coordinator_address", "a:1", "--num_processes", "2"], "--process_id"),
+        (
+            ["--coordinator_address", "a:1", "--num_processes", "2", "--process_id", "2"],
+            "--process_id",
+        ),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, field, tmp_path, capsys):
+    assert monte_carlo.main(["--out", str(tmp_path), *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"monte_carlo: error: {field}")
+
+
+class Stop(Exception):
+    pass
+
+
+def test_what_was_stopped_goes_on_and_gives_the_same(done, tmp_path, monkeypatch):
+    """Stopped after the first file, as kill -9 would: a part of the next one is left."""
+    folder = tmp_path / "runs"
+    monkeypatch.setattr(monte_carlo, "KEPT", 8)
+    real = monte_carlo.keep
+
+    def stopping(*given):
+        real(*given)
+        raise Stop
+
+    monkeypatch.setattr(monte_carlo, "keep", stopping)
+    with pytest.raises(Stop):
+        monte_carlo.work(CASE, RUNS, folder, StringIO())
+    monkeypatch.setattr(monte_carlo, "keep", real)
+    (file,) = folder.iterdir()
+    before = file.stat().st_mtime_ns
+    (folder / ".123.tmp").write_bytes(b"half of")
+    numbers = monte_carlo.work(CASE, RUNS, folder, StringIO())
+    assert told(numbers) == told(done[0]) and file.stat().st_mtime_ns == before
+    assert [f.name for f in sorted(folder.glob("*.npz"))] == ["0000000.npz", "0000008.npz"]
+
+
+def test_runs_of_another_seed_or_program_are_not_mixed_in(done):
+    folder = done[1]
+    with pytest.raises(InputError, match="of another seed"):
+        monte_carlo.work(CASE._replace(seed=6), RUNS, folder)
+
+
+def test_marks_tell_all_that_matters_apart():
+    noise = NoiseParams.for_simulated_robot(*CASE.robot)
+    cases = [
+        CASE,
+        CASE._replace(seed=1),
+        CASE._replace(steps=5),
+        CASE._replace(
+            config=CONFIG._replace(
+                filter=CONFIG.filter._replace(
+                    max_landmarks=8,
+                ),
+            )
+        ),
+        CASE._replace(max_walls=CASE.max_walls + 1e-9),
+        CASE._replace(robot=Robot(encoder_noise=0.1)),
+    ]
+    assert len({monte_carlo.fingerprint(case, noise) for case in cases}) == len(cases)
+    assert monte_carlo.fingerprint(CASE, noise) == monte_carlo.fingerprint(CASE, noise)
+
+
+def test_a_broken_file_is_named(tmp_path):
+    (tmp_path / "0000000.npz").write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(InputError, match=r"0000000\.npz.*broken.*remove it"):
+        monte_carlo.load(tmp_path, "")
+
+
+def test_the_distribution_is_of_the_runs(done):
+    numbers, folder = done
+    (tracks,), _, _ = monte_carlo.load(
+        folder, monte_carlo.fingerprint(CASE, NoiseParams.for_simulated_robot(*CASE.robot))
+    )
+    off = np.linalg.norm((tracks.estimate - tracks.truth)[..., :2], axis=-1)
+    rmse = np.sqrt(np.mean(off**2, axis=1))
+    assert numbers["p50_m"] == pytest.approx(np.median(rmse))
+    assert numbers["p50_m"] <= numbers["p95_m"] <= numbers["p99_m"] <= rmse.max()
+    assert numbers["position_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert sum(numbers["histogram"]["runs"]) == numbers["runs"] == RUNS
+    worst = [one["run"] for one in numbers["worst"]]
+    assert worst == np.argsort(-rmse, kind="stable")[: monte_carlo.WORST].tolist()
+    assert numbers["largest_m"] == pytest.approx(off.max())
+
+
+def test_runs_in_no_number_are_masked_and_listed(done):
+    numbers, folder = done
+    mark = monte_carlo.fingerprint(CASE, NoiseParams.for_simulated_robot(*CASE.robot))
+    (tracks,), _, _ = monte_carlo.load(folder, mark)
+    import jax
+
+    estimate = tracks.estimate.copy()
+    estimate[3, 2] = np.nan
+    found = monte_carlo.summary(jax.random.key(5), tracks._replace(estimate=estimate))
+    assert found["nonfinite_runs"] == [3] and sum(found["histogram"]["runs"]) == RUNS - 1
+    assert np.isfinite(found["p99_m"]) and 3 not in [one["run"] for one in found["worst"]]
+    estimate[:] = np.nan
+    none = monte_carlo.summary(jax.random.key(5), tracks._replace(estimate=estimate))
+    assert none["p50_m"] is None and none["worst"] == []
+
+
+def test_one_run_is_replayed_alone(done):
+    worst = done[0]["worst"][0]
+    alone = monte_carlo.replay(CASE, worst["run"])
+    assert alone["position_rmse_m"] == pytest.approx(worst["position_rmse_m"], rel=1e-12)
+    np.testing.assert_array_equal(alone["worst"][0]["estimate"], worst["estimate"])
+
+
+def test_picture_and_numbers_are_written_and_what_was_kept_goes(done, tmp_path, monkeypatch):
+    row = {"devices": 1, "seconds": 2.0, "ms_per_scan": 1.0, "peak_mb": 500.0}
+    rows = {name: [row | {name: v} for v in values] for name, values in scaling.VARIED.items()}
+    rows["steps"] = [{"chain_note": "it failed"}]
+    two = {"two_vs_one": 1.9, "rows": [row, row | {"devices": 2}]}
+    monkeypatch.setattr(scaling, "compute", lambda *_: rows | {"devices": two})
+    monkeypatch.setattr(monte_carlo, "compute", lambda *_: dict(done[0]))
+    (tmp_path / "monte_carlo_runs").mkdir()
+    assert monte_carlo.main(["--out", str(tmp_path), "--runs", str(RUNS)]) == 0
+    numbers = json.loads((tmp_path / "monte_carlo.json").read_text())
+    keys = "runs diverged nonfinite position_rmse_m p50_m p95_m p99_m seconds seconds_per_scan"
+    assert {*keys.split(), "peak_mb", "devices", "scaling"} <= numbers.keys()
+    assert (tmp_path / "monte_carlo.png").read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "monte_carlo_runs").exists()
+
+
+def test_scaling_measures_each_figure_in_its_own_process(monkeypatch):
+    asked = []
+
+    def measured(task, kept, *, devices, module, whole, **given):
+        assert whole
+        asked.append((devices, given["runs"], given["steps"], given["landmarks"]))
+        return {"seconds": 3.0 / devices, "devices": devices} | given
+
+    monkeypatch.setattr(scaling, "apart", measured)
+    numbers = scaling.compute(0)
+    assert numbers["devices"]["two_vs_one"] == pytest.approx(2.0)
+    for name, values in scaling.VARIED.items():
+        assert [one[name] for one in numbers[name]] == list(values)
+    assert {one[0] for one in asked} == {1, 2}
+    monkeypatch.setattr(scaling, "apart", lambda *_, **__: {"chain_note": "it failed"})
+    none = scaling.compute(0)["devices"]
+    assert none == {"two_vs_one": None, "rows": [], "chain_note": "it failed"}
+
+
+@pytest.mark.timeout(60)
+def test_a_module_that_has_no_such_task_is_told(tmp_path):
+    done = estimator.apart("none", str(tmp_path), module="experiments.scaling")
+    assert "KeyError" in done["none_note"]
+
+
+def test_runs_that_diverged_are_listed_with_their_keys():
+    key = jax.random.key(7)
+    zero = np.zeros((3, 2, 3))
+    off = zero.copy()
+    off[1, 1, 0] = 3.0
+    flags = {"finite": np.ones(3, bool), "judged": np.ones((3, 2), bool)}
+    counts = {"matches": np.zeros((3, 2), np.int32), "landmarks": np.zeros(3, np.int32)}
+    rest = {"cov": np.tile(np.eye(3), (3, 2, 1, 1)), "length": np.full(3, 2, np.int32)}
+    tracks = TrialResult(truth=zero, estimate=off, dead_reckoning=zero, **flags, **counts, **rest)
+    told = monte_carlo.summary(key, tracks)
+    assert told["diverged_runs"] == [1]
+    own = jax.random.key_data(jax.random.fold_in(key, 1))
+    np.testing.assert_array_equal(told["diverged_keys"], [own])
+    none = monte_carlo.summary(key, tracks._replace(estimate=zero + 1e-3))
+    assert none["diverged"] == 0 and none["diverged_keys"].shape == (0, 2)

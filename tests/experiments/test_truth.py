@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from experiments import truth
+from jaxslam.simulation import worlds
+
+ROOM = worlds.outline([(0.0, 0.0, 4.0, 2.0)])
+SIDE = 4.0
+TRIANGLE = worlds.polyline([(0, 0), (SIDE, 0), (SIDE / 2, SIDE * np.sqrt(0.75)), (0, 0)])
+
+
+def in_order(x):
+    return x[np.lexsort(np.round(x, 6).T)]
+
+
+def test_junctions_of_a_room_are_one_half_width_from_its_short_sides():
+    found = truth.junctions(ROOM, truth.Free(ROOM))
+    np.testing.assert_allclose(in_order(found.xy), [[1.0, 1.0], [3.0, 1.0]], atol=1e-9)
+    np.testing.assert_allclose(found.clearance, 1.0, atol=1e-9)
+    np.testing.assert_allclose(found.spread, np.pi / 2, atol=1e-9)
+
+
+def test_the_junction_of_a_triangle_is_the_centre_of_its_incircle():
+    radius = SIDE / np.sqrt(12)
+    found = truth.junctions(TRIANGLE, truth.Free(TRIANGLE))
+    np.testing.assert_allclose(found.xy, [[SIDE / 2, radius]], atol=1e-9)
+    np.testing.assert_allclose(found.clearance, radius, atol=1e-9)
+    np.testing.assert_allclose(found.spread, 2 * np.pi / 3, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "walls, places, cosine",
+    [
+        (ROOM, [[0, 0], [4, 0], [0, 2], [4, 2]], 0.0),
+        (TRIANGLE, [[0, 0], [SIDE, 0], [SIDE / 2, SIDE * np.sqrt(0.75)]], 0.5),
+    ],
+)
+def test_corners_are_where_walls_meet(walls, places, cosine):
+    found = truth.max_corners(walls)
+    np.testing.assert_allclose(in_order(found.xy), in_order(np.array(places, float)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(found.along, axis=-1), 1.0)
+    np.testing.assert_allclose(np.sum(found.along[:, 0] * found.along[:, 1], -1), cosine, atol=1e-9)
+
+
+def test_a_wall_that_ends_on_another_makes_two_corners_and_a_bend_in_line_none():
+    found = truth.max_corners(np.array([[0.0, 0, 4, 0], [4.0, 0, 6, 0], [1.0, 0, 1, 1]]))
+    np.testing.assert_allclose(found.xy, [[1.0, 0.0]] * 2)
+    np.testing.assert_allclose(found.along, [[[0, 1], [1, 0]], [[0, 1], [-1, 0]]], atol=1e-9)
+
+
+def test_a_wall_hides_what_is_behind_it():
+    walls = np.array([[1.0, -1.0, 1.0, 1.0]])
+    places = np.array([[[0.5, 0.0], [2.0, 0.0], [2.0, 1.9], [2.0, 2.1], [-2.0, 0.0]]])
+    seen = truth.in_sight(np.zeros((1, 2)), places, walls)
+    np.testing.assert_array_equal(seen, [[True, False, False, True, True]])
+
+
+def test_free_space_is_the_inside_of_the_largest_room():
+    walls = np.vstack([ROOM, worlds.outline([(5.0, 0.0, 6.0, 1.0)])])
+    places = np.array([[2.0, 1.0], [0.2, 0.2], [5.5, 0.5], [4.5, 1.0], [-1.0, 1.0], [99.0, 0.0]])
+    held = truth.Free(walls).holds(places)
+    np.testing.assert_array_equal(held, [True, True, False, False, False, False])

@@ -1,0 +1,281 @@
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.frontend import line_fitting, segmentation
+from jaxslam.frontend.line_fitting import NO_BEAM, BeamIntervals
+from jaxslam.frontend.segments import SegmentSpec
+from jaxslam.simulation import ray_casting, worlds
+from jaxslam.simulation.worlds import World
+
+SPEC = SegmentSpec()
+SMALL = Lidar(num_beams=61, angle_min=-math.pi / 3, angle_increment=math.pi / 90, range_std=0.01)
+SCANS, PRICE, STEEP = 24, SPEC.segment_cost, 10.0
+runs = jax.jit(segmentation.find_segments, static_argnums=(1, 2))
+cast = jax.jit(ray_casting.cast, static_argnums=2)
+
+
+def angles(scanner):
+    return scanner.angle_min + scanner.angle_increment * np.arange(scanner.num_beams)
+
+
+def cut(ranges, hit, breaks, *, lanes=16, price=PRICE, outlier=SPEC.outlier_cost, steep=STEEP):
+    """Where stretches begin (N, R), of scans of even walls."""
+    options = dict(price=price, outlier=outlier, lanes=lanes, steep=steep, uneven=0.0, grain=1.0)
+
+    @jax.jit
+    @jax.vmap
+    def one(ranges, hit, breaks):
+        scan = Scan(ranges, hit)
+        return line_fitting.partition_beams(SMALL, scan, breaks, 0.01, **options)
+
+    return jax.tree.map(np.asarray, one(*map(jnp.asarray, (ranges, hit, breaks))))
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """Ranges, hits and breaks (N, R) of polylines with noise; some beams did not return."""
+    random = np.random.default_rng(0)
+    turn, ranges = angles(SMALL), np.empty((SCANS, SMALL.num_beams))
+    for r in ranges:
+        knots = np.sort(random.uniform(-1.2, 1.2, 4))
+        at = random.uniform(1.0, 4.0, 6)[:, None] * np.stack(
+            [np.cos([-1.5, *knots, 1.5]), np.sin([-1.5, *knots, 1.5])], axis=1
+        )
+        # On a line the inverse range is a sinusoid of the bearing.
+        part = np.searchsorted(knots, turn)
+        ends = np.stack([at[part], at[part + 1]], axis=1)
+        across = np.linalg.solve(ends, np.ones((SMALL.num_beams, 2, 1)))[..., 0]
+        r[:] = 1 / np.sum(across * np.stack([np.cos(turn), np.sin(turn)], axis=1), axis=1)
+    hit = random.random(ranges.shape) > 0.05
+    ranges = np.where(
+        hit, ranges + SMALL.range_std * random.normal(size=ranges.shape), SMALL.range_max
+    )
+    breaks = ~hit | ~np.roll(hit, 1, axis=1) | (random.random(ranges.shape) < 0.03)
+    breaks[:, 0] = True
+    return ranges, hit, breaks
+
+
+def misfits(ranges, steep=STEEP):
+    """Cost (R, R) of the stretch from one beam to another: of the line that fits it best.
+
+    The inverse ranges are those of the line a cos(turn) + b sin(turn), turned to the first beam,
+    with standard deviations that follow from those of the ranges, and b is about 0 beforehand.
+    """
+    q, turn = 1 / ranges, angles(SMALL)
+    cost = np.full((q.size, q.size), np.nan)
+    for i in range(q.size):
+        c, s = np.cos(turn[i:] - turn[i]), np.sin(turn[i:] - turn[i])
+        rows = np.stack([c, s], axis=1) / (0.01 * q[i:] ** 2)[:, None]
+        right = q[i:] / (0.01 * q[i:] ** 2)
+        rows = np.concatenate([[[0.0, 1 / (steep * q[i])]], rows])
+        right = np.append(0.0, right)
+        for j in range(i, q.size):
+            most = j - i + 2
+            line = np.linalg.lstsq(rows[:most], right[:most], rcond=None)[0]
+            cost[i, j] = np.sum((rows[:most] @ line - right[:most]) ** 2)
+    return cost
+
+
+def price_of(begins, misfit, price=PRICE):
+    """Cost of a cut (R,) bool."""
+    first = np.flatnonzero(begins)
+    last = np.append(first[1:], begins.size) - 1
+    return np.sum(misfit[first, last] + price)
+
+
+def slow_cut(misfit, alone, price):
+    """The cut that costs least: the best of all first beams of the last stretch, and so on."""
+    best, first = [0.0], []
+    for j in range(len(alone)):
+        since = max(i for i in range(j + 1) if alone[i] or i == 0)
+        starts = np.arange(since, j + 1)
+        cost = np.array(best)[starts] + price + misfit[starts, j]
+        best.append(cost.min())
+        first.append(starts[np.argmin(cost)])
+    begins, last = np.zeros(len(alone), bool), len(alone) - 1
+    while last >= 0:
+        begins[first[last]] = True
+        last = first[last] - 1
+    return begins
+
+
+@pytest.mark.parametrize("price", [PRICE, 6.0])  # the second cuts into the noise
+def test_no_cut_costs_less_and_a_few_lanes_all_but_suffice(scans, price):
+    ranges, hit, breaks = scans
+    every, few = (
+        cut(*scans, lanes=n, price=price, outlier=np.inf).begins
+        for n in (SMALL.num_beams, SPEC.num_candidates)
+    )
+    cheap = 0
+    for r, alone, ours, lean in zip(ranges, breaks | ~hit, every, few, strict=True):
+        misfit = misfits(r)
+        best = slow_cut(misfit, alone, price)
+        np.testing.assert_array_equal(ours, best)
+        assert 5 <= best.sum() < 30
+        excess = price_of(lean, misfit, price) - price_of(best, misfit, price)
+        assert excess > -1e-6
+        cheap += excess < 1e-6
+    assert cheap >= 0.9 * SCANS
+
+
+def test_stretches_begin_at_breaks_and_hold_no_beam_without_return(scans):
+    _, hit, breaks = scans
+    begins = cut(*scans).begins
+    assert begins[breaks].all() and begins[~hit].all()
+    assert not begins[hit & ~breaks].all() and begins[hit & ~breaks].any()
+    for k in range(SCANS):
+        spans = line_fitting.longest_intervals(
+            jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40
+        )
+        member = np.asarray(spans.interval_of_beam(SMALL.num_beams)) < 40
+        np.testing.assert_array_equal(member, hit[k])
+
+
+def test_the_mirrored_scan_is_cut_at_the_mirrored_beams(scans):
+    """Up to ties: of a few beams those in the middle may go with either side, at equal cost."""
+    ranges, hit, breaks = scans
+    turned = breaks.copy()
+    turned[:, 1:] = breaks[:, :0:-1]  # before a beam is after it
+    back_to_front = ranges[:, ::-1], hit[:, ::-1], turned
+    here, there = (
+        cut(*scan, lanes=SMALL.num_beams, outlier=np.inf, steep=1e3).begins
+        for scan in (scans, back_to_front)
+    )
+    back = np.ones_like(there)
+    back[:, 1:] = there[:, :0:-1]
+    assert np.mean(np.all(here == back, axis=1)) >= 0.7
+    for k in range(SCANS):
+        misfit = misfits(ranges[k], steep=1e3)
+        np.testing.assert_allclose(price_of(here[k], misfit), price_of(back[k], misfit), atol=1e-3)
+
+
+def test_a_beam_that_strays_does_not_cut_a_wall():
+    """Nor does it move it."""
+    turn, beams = angles(SMALL), np.arange(3, 58, 3)
+    wall = 2.0 / np.cos(turn - 0.2)
+    ranges = np.tile(wall, (len(beams), 1))
+    ranges += 0.005 * np.random.default_rng(0).normal(size=ranges.shape)
+    clean, hit, breaks = ranges.copy(), ranges > 0, np.tile(np.arange(61) == 0, (len(beams), 1))
+    ranges[np.arange(len(beams)), beams] += 0.15
+    strayed, straight = cut(ranges, hit, breaks), cut(clean, hit, breaks)
+    np.testing.assert_array_equal(strayed.begins, breaks)
+    np.testing.assert_array_equal(straight.begins, breaks)
+    np.testing.assert_allclose(strayed.normal[:, -1], straight.normal[:, -1], atol=0.01)
+    np.testing.assert_allclose(straight.normal[:, -1, 0], math.cos(0.2), atol=0.01)
+    assert (cut(ranges, hit, breaks, outlier=np.inf).begins.sum(axis=1) >= 3).all()
+
+
+@pytest.mark.parametrize("ranges", [0.0, SMALL.range_max])
+def test_a_scan_without_returns_has_no_runs_and_finite_numbers(ranges):
+    nothing = Scan(jnp.full(61, ranges), jnp.zeros(61, bool))
+    parts = cut(nothing.ranges[None], nothing.hit[None], nothing.hit[None])
+    assert parts.begins.all() and np.isfinite(parts.normal).all()
+    spans = line_fitting.longest_intervals(jnp.asarray(parts.begins[0]), nothing.hit, capacity=5)
+    assert spans.first.tolist() == [NO_BEAM] * 5 and spans.last.tolist() == [-1] * 5
+    found = runs(nothing, SMALL, SPEC)
+    assert not found.valid.any() and not found.meets.any()
+    assert all(np.isfinite(np.asarray(field, float)).all() for field in found)
+
+
+@pytest.mark.parametrize("noise, step", [(0.01, 1.0), (0.03, 0.5)])
+def test_a_straight_noisy_wall_is_one_run(noise, step):
+    beams = int(100 / step) + 1
+    scanner = Lidar(
+        num_beams=beams,
+        angle_min=-math.radians(50),
+        angle_increment=math.radians(step),
+        range_std=noise,
+    )
+    walls = World(jnp.array([[2.0, -9.0, 2.0, 9.0]]))
+    clean = cast(walls, jnp.zeros(3), scanner)
+    keys = jax.random.split(jax.random.key(0), 200)
+    one = lambda key: segmentation.find_segments(
+        scanner, SPEC, ray_casting.add_range_noise(key, scanner, clean)
+    ).valid.sum()
+    count = np.asarray(jax.jit(jax.vmap(one))(keys))
+    assert np.mean(count == 1) >= 0.98, np.bincount(count)
+
+
+def test_a_wall_that_steps_by_a_few_centimetres_is_one_run():
+    """Seen from near and at a grazing angle, whatever the noise; but not if held for even."""
+    walls = World(jnp.asarray(worlds.named("fig06d").walls))
+    random, poses = np.random.default_rng(0), np.zeros((60, 3))
+    poses[:, 0], poses[:, 1] = random.uniform(0.0, 2.5, 60), random.uniform(-0.6, 0.6, 60)
+    poses[:, 2] = random.uniform(-0.2, 0.2, 60)
+
+    def one(spec, scanner, key, pose):
+        scan = ray_casting.add_range_noise(key, scanner, ray_casting.cast(scanner, walls, pose))
+        return segmentation.find_segments(scanner, spec, scan).valid.sum()
+
+    keys = jax.random.split(jax.random.key(0), 60)
+
+    def counts(spec, noise):
+        many = jax.jit(jax.vmap(partial(one, spec, Lidar(range_std=noise))))
+        return np.asarray(many(keys, jnp.asarray(poses)))
+
+    for noise in (0.0, 0.03):
+        ours = counts(SPEC, noise)
+        assert np.mean(ours == 2) >= 0.7 and ours.max() <= 4, np.bincount(ours)
+    cut_up = counts(SPEC._replace(roughness_std=1e-4), 0.0)
+    assert np.mean(cut_up > 4) >= 0.9, np.bincount(cut_up)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_corner_is_put_at_its_beam(noise):
+    scanner = Lidar(
+        num_beams=181, angle_min=-math.pi / 4, angle_increment=math.pi / 360, range_std=0.01
+    )
+    walls = World(jnp.asarray(worlds.polyline([(3.0, -9.0), (3.0, 1.0), (-2.0, 1.0)])))
+    scan = cast(walls, jnp.zeros(3), scanner)
+    if noise:
+        scan = ray_casting.add_range_noise(jax.random.key(1), scanner, scan)
+    of = np.asarray(runs(scan, scanner, SPEC).segment_of_beam)
+    beam = (math.atan2(1.0, 3.0) - scanner.angle_min) / scanner.angle_increment  # 126.9
+    np.testing.assert_allclose(np.flatnonzero(np.diff(of)) + 0.5, beam, atol=1.5 if noise else 0.5)
+    assert of[0] == 0 and of[-1] == 1
+
+
+def pairs_of(spans):
+    pairs = zip(spans.first.tolist(), spans.last_seen.tolist(), strict=True)
+    return [(a, b) for a, b in pairs if b >= 0]
+
+
+def test_the_longest_are_kept_in_the_order_of_the_beams():
+    begins = jnp.isin(jnp.arange(24), jnp.array([0, 5, 7, 10, 11, 21]))
+    hit = jnp.arange(24) < 21
+    kept = line_fitting.longest_intervals(begins, hit, capacity=3)
+    assert pairs_of(kept) == [(0, 4), (7, 9), (11, 20)]
+    of = [0] * 5 + [3] * 2 + [1] * 3 + [3] + [2] * 10 + [3] * 3
+    np.testing.assert_array_equal(kept.interval_of_beam(24), of)
+    np.testing.assert_array_equal(kept.size, [5, 3, 10])
+    more = line_fitting.longest_intervals(begins, hit, capacity=7)
+    assert pairs_of(more) == [(0, 4), (5, 6), (7, 9), (10, 10), (11, 20)]
+    assert more.first.tolist()[5:] == [NO_BEAM] * 2 and more.last.tolist()[5:] == [-1] * 2
+
+
+def test_padding_holds_no_beam():
+    padded = BeamIntervals(jnp.array([0, NO_BEAM], jnp.int32), jnp.array([4, -1], jnp.int32))
+    np.testing.assert_array_equal(padded.size, [5, 0])
+    np.testing.assert_array_equal(padded.interval_of_beam(6), [0] * 5 + [2])
+
+
+def test_moments_and_principal_axes_are_those_of_numpy():
+    random = np.random.default_rng(0)
+    xy, weight, of = random.normal(size=(40, 2)), random.uniform(0.5, 2, 40), np.arange(40) % 4
+    xy = xy @ np.array([[2.0, 0.3], [0.0, 0.4]]) + 3.0
+    sums = line_fitting.line_moments(*map(jnp.asarray, (xy, weight, of.astype(np.int32))), lines=3)
+    normal, across, along = line_fitting.principal_axes(sums.scatter)
+    for k in range(3):  # those of the fourth count nowhere
+        own = of == k
+        scatter = np.cov(xy[own].T, aweights=weight[own], ddof=0) * weight[own].sum()
+        np.testing.assert_allclose(sums.weight[k], weight[own].sum())
+        np.testing.assert_allclose(sums.mean[k], np.average(xy[own], axis=0, weights=weight[own]))
+        value, vector = np.linalg.eigh(scatter)
+        np.testing.assert_allclose([across[k], along[k]], value)
+        np.testing.assert_allclose(np.abs(vector[:, 0] @ normal[k]), 1.0)

@@ -1,0 +1,232 @@
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from jaxslam.core.se2 import compose
+from jaxslam.io import readers, ros_bags
+from jaxslam.io.errors import InputError
+
+START, SCANS, BEAMS = 1_600_000_000.25, 8, 6
+FIRST, STEP, LEAST, MOST = -0.9, 0.3, 0.1, 12.0
+MOUNT = np.array([0.25, -0.1, 0.3])  # of the scanner on the robot
+TRANSFORMS = ros_bags.TRANSFORMS[0]
+STORES = {1: Stores.ROS1_NOETIC, 2: Stores.ROS2_HUMBLE}
+
+
+def ranges():
+    return np.random.default_rng(0).uniform(0.5, 9.0, (SCANS, BEAMS)).astype(np.float32)
+
+
+def way(t):
+    """Pose of the robot by its wheels at a time since the start; straight lines between halves."""
+    return np.interp(t, [0, 2, 9], [0, 1, 4]), 0.1 * t, 0.2 * t
+
+
+def quaternion(yaw, roll=0.0):
+    """Turned by `roll` about x, then by `yaw` about z."""
+    c, s, a, b = np.cos(yaw / 2), np.sin(yaw / 2), np.cos(roll / 2), np.sin(roll / 2)
+    return c * b, s * b, s * a, c * a
+
+
+class Maker:
+    """Messages of one of the two systems."""
+
+    def __init__(self, ros):
+        self.ros, self.store = ros, get_typestore(STORES[ros])
+        if ros == 1:
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, TRANSFORMS))
+        self.of = self.store.types
+
+    def header(self, t, frame):
+        t += START
+        stamp = self.of["builtin_interfaces/msg/Time"](int(t), round(1e9 * (t - int(t))))
+        seq = {"seq": 0} if self.ros == 1 else {}
+        return self.of["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **seq)
+
+    def scan(self, t, reads, *, first=FIRST, step=STEP, frame="laser"):
+        last = first + step * (len(reads) - 1)
+        return self.of[ros_bags.SCAN](
+            self.header(t, frame), first, last, step, 0.0, 0.1, LEAST, MOST,
+            np.asarray(reads, np.float32), np.zeros(0, np.float32),
+        )  # fmt: skip
+
+    def odometry(self, t, pose):
+        of, cov = self.of, np.zeros(36)
+        point = of["geometry_msgs/msg/Point"](pose[0], pose[1], 0.0)
+        turn = of["geometry_msgs/msg/Quaternion"](*quaternion(pose[2]))
+        where = of["geometry_msgs/msg/Pose"](point, turn)
+        none = of["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        speed = of["geometry_msgs/msg/Twist"](none, none)
+        return of[ros_bags.ODOMETRY](
+            self.header(t, "odom"), "base_link",
+            of["geometry_msgs/msg/PoseWithCovariance"](where, cov),
+            of["geometry_msgs/msg/TwistWithCovariance"](speed, cov),
+        )  # fmt: skip
+
+    def transform(self, t, parent, child, pose, roll=0.0):
+        of = self.of
+        move = of["geometry_msgs/msg/Vector3"](pose[0], pose[1], 0.2)
+        turn = of["geometry_msgs/msg/Quaternion"](*quaternion(pose[2], roll))
+        both = of["geometry_msgs/msg/Transform"](move, turn)
+        one = of["geometry_msgs/msg/TransformStamped"](self.header(t, parent), child, both)
+        return of[TRANSFORMS]([one])
+
+
+def write(path, ros, *, poses="odometry", mount=True, roll=0.0, scans=SCANS, **how):
+    """A bag of scans at 0.5, 1.5 ... and poses at 0, 1, 2 ... seconds."""
+    make = Maker(ros)
+    said = []  # time, topic, type, message
+    if mount:
+        said.append((0.0, "/tf_static", TRANSFORMS,
+                     make.transform(0.0, "base_link", "mount", (0.1, 0.0, 0.0))))  # fmt: skip
+        rest = (MOUNT[0] - 0.1, MOUNT[1], MOUNT[2])
+        said.append((0.0, "/tf_static", TRANSFORMS,
+                     make.transform(0.0, "mount", "laser", rest, roll)))  # fmt: skip
+    for t in np.arange(0.0, scans + 1.0):
+        if poses == "odometry":
+            said.append((t, "/odom", ros_bags.ODOMETRY, make.odometry(t, way(t))))
+        if poses == "tf":
+            one = make.transform(t, "odom", "base_link", way(t))
+            said.append((t, "/tf", TRANSFORMS, one))
+    for i in range(scans):
+        one = make.scan(i + 0.5, ranges()[i % SCANS], **how)
+        said.append((i + 0.5, "/scan", ros_bags.SCAN, one))
+    if ros == 1:
+        writer = rosbag1.Writer(path)
+        pack = make.store.serialize_ros1
+    else:
+        writer = rosbag2.Writer(path, version=9)
+        pack = make.store.serialize_cdr
+    with writer:
+        known = {}
+        for t, topic, kind, message in sorted(said, key=lambda one: one[0]):
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=make.store)
+            writer.write(known[topic], int(1e9 * (START + t)), pack(message, kind))
+    return path
+
+
+@pytest.fixture(params=[1, 2], ids=["ros1", "ros2"])
+def ros(request):
+    return request.param
+
+
+def place(tmp_path, ros):
+    return tmp_path / ("drive.bag" if ros == 1 else "drive")
+
+
+@pytest.mark.parametrize("poses", ["odometry", "tf"])
+def test_scans_and_poses_of_the_scanner_are_read(tmp_path, ros, poses):
+    path = write(place(tmp_path, ros), ros, poses=poses)
+    found = ros_bags.read(path)
+    np.testing.assert_array_equal(found.ranges, ranges())
+    np.testing.assert_allclose(found.times - START, np.arange(SCANS) + 0.5, atol=1e-6)
+    for i in range(SCANS):
+        before, after = (compose(jnp.array(way(float(t))), jnp.asarray(MOUNT)) for t in (i, i + 1))
+        np.testing.assert_allclose(found.odom_poses[i], (before + after) / 2, atol=1e-9)
+    np.testing.assert_allclose(found.lidar[:4], (BEAMS, FIRST, STEP, MOST), rtol=1e-6)
+    assert found.num_skipped == 0 and len(found.odom_stream_times) == SCANS + 1
+    for a, b in zip(readers.read(path), found, strict=True):
+        np.testing.assert_array_equal(a, b)
+    right = "/odom" if poses == "odometry" else "/tf"
+    assert ros_bags.topics(path) == ("/scan", right)
+
+
+def test_a_file_of_a_folder_stands_for_it(tmp_path):
+    path = write(tmp_path / "drive", 2)
+    (file,) = path.glob("*.db3")
+    np.testing.assert_array_equal(ros_bags.read(file).ranges, ros_bags.read(path).ranges)
+
+
+def test_without_transforms_the_scanner_is_the_robot(tmp_path, ros):
+    found = ros_bags.read(write(place(tmp_path, ros), ros, mount=False))
+    np.testing.assert_allclose(found.odom_stream_poses[3], way(3.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("roll", [0.0, np.pi])
+@pytest.mark.parametrize("step", [STEP, -STEP])
+def test_beams_go_from_right_to_left_however_the_scanner_hangs(tmp_path, roll, step):
+    """Each reading stays at the point where it was, in the frame of the robot."""
+    found = ros_bags.read(write(tmp_path / "drive", 2, roll=roll, step=step))
+    angles = FIRST + step * np.arange(BEAMS)
+    local = np.stack([np.cos(angles), np.sin(angles), 0 * angles]) * ranges()[0]
+    x, y, z, w = quaternion(MOUNT[2], roll)
+    q = np.array([x, y, z])
+    turned = local + 2 * np.cross(q, np.cross(q, local.T) + w * local.T).T
+    right = turned[:2].T + MOUNT[:2]
+    lidar = found.lidar
+    seen = lidar.angle_min + lidar.angle_increment * np.arange(BEAMS) + MOUNT[2]
+    ours = MOUNT[:2] + found.ranges[0][:, None] * np.stack([np.cos(seen), np.sin(seen)], axis=1)
+    assert lidar.angle_increment > 0
+    key = lambda points: points[np.lexsort(points.T.round(6))]
+    np.testing.assert_allclose(key(ours), key(right), atol=1e-5)
+
+
+def test_what_returned_nothing_is_infinite(tmp_path):
+    bag = write(tmp_path / "drive", 2)
+    found = ros_bags.read(bag, range_max=3.0)
+    assert np.array_equal(np.isinf(found.ranges), ranges() >= 3.0) and found.lidar.range_max == 3.0
+
+
+def test_scans_outside_the_time_of_the_odometry_are_left_out_and_counted(tmp_path):
+    found = ros_bags.read(write(tmp_path / "drive", 2, scans=30))
+    assert len(found.ranges) == 30
+    path = tmp_path / "late"
+    make, scans = Maker(2), 30
+    with rosbag2.Writer(path, version=9) as writer:
+        odom = writer.add_connection("/odom", ros_bags.ODOMETRY, typestore=make.store)
+        scan = writer.add_connection("/scan", ros_bags.SCAN, typestore=make.store)
+        for i in range(scans):
+            one = make.scan(float(i), ranges()[0])
+            writer.write(scan, i + 1, make.store.serialize_cdr(one, ros_bags.SCAN))
+            if i < scans - 1:
+                one = make.odometry(float(i), way(i))
+                writer.write(odom, i + 1, make.store.serialize_cdr(one, ros_bags.ODOMETRY))
+    late = ros_bags.read(path)
+    assert len(late.ranges) == scans - 1 and late.num_skipped == 1
+
+
+def test_topics_can_be_named_and_wrong_ones_are_told(tmp_path, ros):
+    path = write(place(tmp_path, ros), ros)
+    named = ros_bags.read(path, scan_topic="/scan", odometry_topic="/odom")
+    np.testing.assert_array_equal(named.ranges, ranges())
+    with pytest.raises(InputError, match=r"scans: there is no .*LaserScan in '/s'; .*: /scan"):
+        ros_bags.read(path, scan_topic="/s")
+    with pytest.raises(InputError, match="odometry: there is no"):
+        ros_bags.read(path, odometry_topic="/scan")
+
+
+def test_bags_that_lack_something_are_told(tmp_path, ros):
+    path = write(place(tmp_path, ros), ros, poses="none", mount=False)
+    with pytest.raises(InputError, match="has no nav_msgs/msg/Odometry or tf2.*topics are: /scan"):
+        ros_bags.read(path)
+    other = tmp_path / "mount" / ("a.bag" if ros == 1 else "a")
+    other.parent.mkdir()
+    with pytest.raises(InputError, match="has no transform from 'odom'"):
+        ros_bags.read(write(other, ros, poses="none"))
+    with pytest.raises(InputError, match="does not exist"):
+        ros_bags.read(tmp_path / "none.bag")
+
+
+def test_damaged_bags_never_end_in_a_traceback(tmp_path, ros):
+    whole = write(place(tmp_path, ros), ros)
+    rng = np.random.default_rng(0)
+    for number in range(25):
+        path = tmp_path / f"{number}" / whole.name
+        path.parent.mkdir()
+        copy = shutil.copy if ros == 1 else shutil.copytree
+        copy(whole, path)
+        file = path if ros == 1 else sorted(path.iterdir())[number % 2]
+        data = bytearray(file.read_bytes())
+        for at in rng.integers(len(data), size=rng.integers(1, 8)):
+            data[at] = rng.integers(256)
+        file.write_bytes(data[: rng.integers(len(data))] if number % 5 == 0 else data)
+        try:
+            assert np.isfinite(ros_bags.read(path).odom_poses).all()
+        except InputError as error:
+            assert "\n" not in str(error)

@@ -1,4 +1,4 @@
-"""What every experiment shares: its arguments, its two files, and pictures of cells."""
+"""Shared by all experiments: arguments, the two files they write, and pictures of cells."""
 
 import argparse
 import json
@@ -12,9 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from jaxslam.core import trace_cache
 from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.types import Key
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, voronoi
 from jaxslam.frontend.automaton import Diagram
@@ -22,19 +24,25 @@ from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.grid import GridSpec, centres
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import plain, write_json
+from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import worlds
+from jaxslam.pipeline.episodes import TrialResult
+from jaxslam.simulation import drives, path_following, trials, worlds
 from jaxslam.simulation.ray_casting import cast
+from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
     *("#000000", "#E69F00", "#56B4E9", "#009E73"),
     *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
 )
-"""The colours of Okabe and Ito, which colour-blind people can tell apart."""
+"""The colours of Okabe and Ito, which colour-blind people can distinguish."""
 
 EMPTY, BRANCH = ".", "*"
 NAMES = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJ"  # of the labels, in the order of their bits
+
+LABEL_KEYS = {"segments": "runs", "codes": "codes"}
+"""How JSON files spell the modes of `FrontendConfig.labels`, as they always did."""
 
 Numbers = dict[str, Any]
 """Results of an experiment: dicts, lists, numbers and strings."""
@@ -43,7 +51,7 @@ GRID = GridSpec(x_max=7.95, x_min=-0.25, y_half=8.05)
 """Grid whose cells have their centres on multiples of 0.1 m, where the worlds have their walls."""
 
 Window = tuple[float, float, float, float]
-"""Part of the robot frame: x from, x to, y from, y to [m]."""
+"""Window of the base_link frame: x from, x to, y from, y to [m]."""
 
 
 def parse(description: str | None, argv: list[str] | None = None, **extra: Any):
@@ -62,24 +70,27 @@ def parse(description: str | None, argv: list[str] | None = None, **extra: Any):
     return parser.parse_args(argv)
 
 
-def ended(name: str, *more: type[Exception]) -> Callable[[Callable], Callable]:
-    """Decorator of a `main` that returns its exit code: what cannot be done is one line and 2.
+Main = Callable[[list[str] | None], int]
+
+
+def report_errors(name: str, *errors: type[Exception]) -> Callable[[Main], Main]:
+    """Decorator of a `main` that returns its exit code: bad input is one line and exit code 2.
 
     Args:
         name: Of the experiment.
-        more: Errors that are told, beside InputError; Ctrl-C is 130.
+        errors: Errors that are printed likewise, beside InputError; Ctrl-C returns 130.
     """
 
-    def decorate(main: Callable[[list[str] | None], int]) -> Callable[[list[str] | None], int]:
+    def decorate(main: Main) -> Main:
         @wraps(main)
         def run(argv: list[str] | None = None) -> int:
             try:
                 return main(argv)
-            except (InputError, *more) as error:
+            except (InputError, *errors) as error:
                 print(f"{name}: error: {error}", file=sys.stderr)
                 return 2
             except KeyboardInterrupt:
-                print(f"{name}: interrupted; the same command goes on", file=sys.stderr)
+                print(f"{name}: interrupted; the same command resumes", file=sys.stderr)
                 return 130
 
         return run
@@ -87,16 +98,22 @@ def ended(name: str, *more: type[Exception]) -> Callable[[Callable], Callable]:
     return decorate
 
 
-class Kept:
-    """Parts of an experiment that are kept as files until it is done, so that it can be stopped."""
+class ResultCache:
+    """Partial results of an experiment, kept as files until it is done, so that it can resume."""
 
     def __init__(self, folder: Path, about: Any):
-        """Keep parts in `folder`; those of another program, or `about` something else, are not."""
+        """Keep results in `folder`.
+
+        Args:
+            folder: Where the files are.
+            about: What the results depend on; those of another program or `about` are computed
+                again.
+        """
         self._folder = folder
         self._about = f"{about!r}, {trace_cache.version()}"
 
     def __call__(self, name: str, make: Callable[[], Numbers]) -> Numbers:
-        """What `make` returns, as JSON has it: made now, or by an earlier call."""
+        """The result of `make` as JSON holds it: computed now, or by an earlier call."""
         file = self._folder / f"{name.replace(' ', '_')}.json"
         if file.is_file():
             try:
@@ -104,14 +121,14 @@ class Kept:
                 if found["about"] == self._about:
                     return found["numbers"]
             except (ValueError, KeyError, TypeError):
-                pass  # made anew
+                pass  # computed again
         numbers = plain(make())
         self._folder.mkdir(parents=True, exist_ok=True)
         write_json(file, {"about": self._about, "numbers": numbers})
         return numbers
 
     def clear(self) -> None:
-        """Remove all of it."""
+        """Remove all files."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
@@ -132,7 +149,7 @@ def canvas(width: float, height: float, rows: int, columns: int, widths: list[in
     return figure, figure.subplots(rows, columns, squeeze=False, width_ratios=widths)
 
 
-def plain_log(axis) -> None:
+def log_scale(axis) -> None:
     """Make the y axis logarithmic, with plain numbers at 1, 2 and 5 times the powers of ten."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -150,18 +167,13 @@ def scan_of(name: str, lidar: Lidar) -> Scan:
 
 @partial(jax.jit, static_argnums=0)
 def _diagram(config: Config, scan: Scan) -> tuple[Diagram, jnp.ndarray]:
-    """Diagram and source cells of a scan; the landmarks are not even compiled."""
+    """Diagram and source cells of a scan; its features are not even compiled."""
     return extract.extract_diagram(config.frontend, scan)[1:]
 
 
-def look(name: str, mode: str) -> tuple[Diagram, np.ndarray]:
+def local_diagram(name: str, labels: str) -> tuple[Diagram, np.ndarray]:
     """Diagram of the world `name` as seen from its origin, and its source cells (H, W)."""
-    config = Config(
-        frontend=FrontendConfig(
-            labels=mode,
-            grid=GRID,
-        ),
-    )
+    config = Config(frontend=FrontendConfig(labels=labels, grid=GRID))
     diagram, sources = _diagram(config, scan_of(name, config.frontend.lidar))
     return diagram, np.asarray(sources)
 
@@ -177,17 +189,20 @@ def cut(cells: np.ndarray, window: Window) -> np.ndarray:
 
 def text_of(labels: np.ndarray, branch: np.ndarray) -> list[str]:
     """A line of text for each row of cells: its label's name, `*` for a branch, `.` for none."""
-    one = lambda label, met: (
-        BRANCH if met else NAMES[int(label).bit_length() - 1] if label else EMPTY
-    )
+
+    def letter(label: int, is_branch: bool) -> str:
+        if is_branch:
+            return BRANCH
+        return NAMES[label.bit_length() - 1] if label else EMPTY
+
     return [
-        "".join(one(*pair) for pair in zip(*row, strict=True))
+        "".join(letter(*cell) for cell in zip(*row, strict=True))
         for row in zip(labels.tolist(), branch.tolist(), strict=True)
     ]
 
 
 def picture(diagram: Diagram, sources: np.ndarray, window: Window) -> Numbers:
-    """Regions and branches, and sources, of a diagram as lines of text, x and y ascending."""
+    """Regions, branches and sources of a diagram as lines of text, x and y ascending."""
     labels, branch = np.asarray(diagram.labels), np.asarray(voronoi.branch_cells(diagram, sources))
     regions, none = np.where(sources, 0, labels), np.zeros_like(sources)
     seeds = np.where(sources, labels, 0)
@@ -199,7 +214,7 @@ def picture(diagram: Diagram, sources: np.ndarray, window: Window) -> Numbers:
 
 
 def colour(name: str, order: str) -> str:
-    """Colour of a label, by its place among the labels of the picture."""
+    """Colour of a label, by its position among the labels of the picture."""
     return (SKY, ORANGE, GREEN, PINK, YELLOW, BLUE, RED)[order.index(name) % 7]
 
 
@@ -225,33 +240,27 @@ def draw_picture(axis, drawn: Numbers) -> None:
     axis.set(xlabel="y, to the left [m]", ylabel="x, ahead [m]")
 
 
-def scene(name: str = "office"):
+def drive_in(name: str = "office") -> tuple[World, Robot, jnp.ndarray, int]:
     """World, robot, path (N, 2) and number of scans of the drive in a world."""
-    from jaxslam.simulation import drives, path_following
-    from jaxslam.simulation.robot import Robot
-
     robot, path = Robot(), jnp.asarray(path_following.densify(worlds.waypoints(name)), float)
-    place = World(jnp.asarray(worlds.named(name).walls, float))
-    return place, robot, path, drives.num_scans_of_drive(robot, path)
+    world = World(jnp.asarray(worlds.named(name).walls, float))
+    return world, robot, path, drives.num_scans_of_drive(robot, path)
 
 
-def part(runs: Any, chosen: Any) -> Any:
-    """Some of the runs that lead records of arrays, as NumPy's."""
-    return jax.tree.map(lambda x: np.asarray(x)[chosen], runs)
+def take(records: Any, index: Any) -> Any:
+    """Some items of records that lead with their number, as NumPy arrays."""
+    return jax.tree.map(lambda x: np.asarray(x)[index], records)
 
 
-def many(key, config: Config, noise: NoiseParams, runs: int, name: str = "office"):
-    """Tracks of B runs of the drive in a world, with a progress bar."""
-    from tqdm import tqdm
-
-    from jaxslam.pipeline import episodes
-    from jaxslam.simulation import trials
-
-    place, robot, path, steps = scene(name)
+def filter_trials(
+    key: Key, config: Config, params: NoiseParams, num_trials: int, name: str = "office"
+) -> TrialResult:
+    """Simulate and filter B trials of the drive in a world, with a progress bar."""
+    world, robot, path, num_scans = drive_in(name)
     parts = []
-    with tqdm(total=runs, unit="run", leave=False) as bar:
+    with tqdm(total=num_trials, unit="trial", leave=False) as bar:
         for part in trials.run_trials(
-            key, config, robot, noise, place, path, num_trials=runs, num_scans=steps
+            key, config, params, robot, world, path, num_trials=num_trials, num_scans=num_scans
         ):
             parts.append(part)
             bar.update(len(part.finite))

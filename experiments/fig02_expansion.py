@@ -1,4 +1,4 @@
-"""Fig. 2 of the paper: how the cells around one source, and around two, are reached."""
+"""Fig. 2 of the paper: arrival step and label of the cells around one source, and around two."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def cell_text(arrival: int, labels: int) -> str:
 
 
 def table(name: str, steps: int) -> list[list[str]]:
-    """The same table as the automaton makes it."""
+    """The same table as computed by the automaton."""
     shape, columns = SOURCES[name]
     labels = np.zeros(shape, np.uint8)
     labels[2, columns] = 1 << np.arange(len(columns))
@@ -54,10 +54,13 @@ def table(name: str, steps: int) -> list[list[str]]:
 
 
 def compute() -> Numbers:
-    """Both tables, and whether they are the paper's, cell by cell."""
+    """Both tables, and whether they equal the paper's, cell by cell."""
     tables = {name: table(name, STEPS) for name in SOURCES}
-    blank = lambda rows: [["" if text == "*" else text for text in row] for row in rows]
-    equal = {name: blank(rows) == printed_in_paper(name) for name, rows in tables.items()}
+    blank = {
+        name: [["" if text == "*" else text for text in row] for row in rows]
+        for name, rows in tables.items()
+    }
+    equal = {name: rows == printed_in_paper(name) for name, rows in blank.items()}
     meets = [[i, row.index("*")] for i, row in enumerate(table("two", STEPS + 1)) if "*" in row]
     return {
         "steps": STEPS,
@@ -95,10 +98,10 @@ def draw(numbers: Numbers, path: Path) -> None:
     figure.savefig(path)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
-    given = parse(__doc__)
-    save(given.out, "fig02_expansion", compute(), draw)
+    args = parse(__doc__, argv)
+    save(args.out, "fig02_expansion", compute(), draw)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from experiments.common import (
     BLUE,
     GREEN,
     GRID,
+    LABEL_KEYS,
     ORANGE,
     PINK,
     RED,
@@ -17,7 +18,7 @@ from experiments.common import (
     canvas,
     cut,
     draw_picture,
-    look,
+    local_diagram,
     parse,
     picture,
     save,
@@ -41,20 +42,23 @@ def labels_of(face: tuple[float, ...], labels: np.ndarray) -> int:
 
 
 def between_faces(diagram, sources: np.ndarray) -> Numbers:
-    """Branch cells within 1 m of the box that part the regions of its two faces.
+    """Branch cells within 1 m of the box that separate the regions of its two faces.
 
-    Edge codes give the corner of the box a label of its own, so that there the faces are parted
-    by the region of the corner, with a branch on either side.
+    Edge codes give the corner of the box its own label. There the region of the corner separates
+    the faces, with a branch on either side.
     """
     labels = np.asarray(diagram.labels)
     starts = np.where(sources, labels, 0)
-    front, side, corner = (labels_of(part, starts) for part in (FRONT, SIDE, CORNER))
+    front, side, corner = (labels_of(face, starts) for face in (FRONT, SIDE, CORNER))
     corner &= ~(front | side)
     near = np.asarray(block_union(np.where(sources, 0, labels)))
     x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
     close = np.hypot(x - CORNER[0] - 0.05, y - CORNER[2] - 0.05) < 1.0
     branch = np.asarray(branch_cells(diagram, sources)) & close
-    touching = lambda *parts: int((branch & np.all([near & p != 0 for p in parts], axis=0)).sum())
+
+    def touching(*regions: int) -> int:
+        return int((branch & np.all([near & region != 0 for region in regions], axis=0)).sum())
+
     direct, first, second = touching(front, side), touching(front, corner), touching(corner, side)
     return {
         "faces_differ": front & side == 0 and front != 0 and side != 0,
@@ -69,13 +73,12 @@ def compute() -> Numbers:
     """Codes of the cells, and in each mode the diagram and the branch between the faces."""
     lidar = Lidar()
     code = edge_codes(GRID, rasterise(lidar, GRID, scan_of("fig04", lidar)))
-    seen = {mode: look("fig04", mode) for mode in ("codes", "runs")}
-    digits = lambda row: "".join(str(c) if c else "." for c in row)
+    diagrams = {LABEL_KEYS[mode]: local_diagram("fig04", mode) for mode in ("codes", "segments")}
     return {
         "window_m": WINDOW,
-        "codes": [digits(row) for row in cut(code, WINDOW).tolist()],
-        "branch_between_faces": {mode: between_faces(*pair) for mode, pair in seen.items()},
-        "pictures": {mode: picture(*pair, WINDOW) for mode, pair in seen.items()},
+        "codes": ["".join(str(c) if c else "." for c in row) for row in cut(code, WINDOW).tolist()],
+        "branch_between_faces": {key: between_faces(*pair) for key, pair in diagrams.items()},
+        "pictures": {key: picture(*pair, WINDOW) for key, pair in diagrams.items()},
     }
 
 
@@ -102,17 +105,17 @@ def draw(numbers: Numbers, path: Path) -> None:
     """Draw the codes and both diagrams."""
     figure, axes = canvas(9.4, 3.2, 1, 3)
     draw_codes(axes[0, 0], numbers["codes"], numbers["window_m"])
-    for axis, mode in zip(axes[0, 1:], ("codes", "runs"), strict=True):
-        draw_picture(axis, numbers["pictures"][mode])
+    for axis, mode in zip(axes[0, 1:], ("codes", "segments"), strict=True):
+        draw_picture(axis, numbers["pictures"][LABEL_KEYS[mode]])
         axis.set_title(f"diagram, labels: {mode}")
         axis.label_outer()
     figure.savefig(path)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
-    given = parse(__doc__)
-    save(given.out, "fig04_object", compute(), draw)
+    args = parse(__doc__, argv)
+    save(args.out, "fig04_object", compute(), draw)
 
 
 if __name__ == "__main__":

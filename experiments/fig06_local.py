@@ -5,14 +5,24 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import label
 
-from experiments.common import GRID, Numbers, canvas, draw_picture, look, parse, picture, save
+from experiments.common import (
+    GRID,
+    LABEL_KEYS,
+    Numbers,
+    canvas,
+    draw_picture,
+    local_diagram,
+    parse,
+    picture,
+    save,
+)
 from jaxslam.frontend.grid import centres
 from jaxslam.frontend.voronoi import branch_cells, junction_cells
 
 WINDOW = (-0.25, 6.05, -2.25, 2.25)
 MEASURED = (0.25, 4.75)  # [m] along x
 HALF = 1.1  # [m] to either side: branches beyond are in an alcove or behind a column
-MODES = ("runs", "codes")
+MODES = ("segments", "codes")
 WORLDS = {
     "fig06a": "(a) parallel walls",
     "fig06b": "(b) an opening",
@@ -23,7 +33,7 @@ CELL = GRID.cell_size
 
 
 def measure(diagram, sources: np.ndarray) -> Numbers:
-    """Where the branches of a corridor run.
+    """Position of the branches of a corridor.
 
     The middle line is, in each row of cells, the branch cell nearest to the one in the row before;
     branch cells more than a cell and a half away from it, sideways, are side branches.
@@ -31,11 +41,11 @@ def measure(diagram, sources: np.ndarray) -> Numbers:
     x, y = np.moveaxis(np.asarray(centres(GRID)), -1, 0)
     inside = (x > MEASURED[0]) & (x < MEASURED[1]) & (np.abs(y) < HALF)
     branch = np.asarray(branch_cells(diagram, sources)) & inside
-    profile, at, beside = [], 0.0, 0
+    profile, at, side_cells = [], 0.0, 0
     for row in np.flatnonzero(branch.any(axis=1)):
         cells = y[row, branch[row]]
         at = cells[np.argmin(np.abs(cells - at))]
-        beside += int(np.sum(np.abs(cells - at) > 1.5 * CELL))
+        side_cells += int(np.sum(np.abs(cells - at) > 1.5 * CELL))
         profile.append([x[row, 0], at])
     line = np.array(profile)
     return {
@@ -43,7 +53,7 @@ def measure(diagram, sources: np.ndarray) -> Numbers:
         "largest_offset_m": round(float(np.abs(line[:, 1]).max()), 3),
         "rows_without_branch": int((inside.any(axis=1) & ~branch.any(axis=1)).sum()),
         "pieces": int(label(branch, np.ones((3, 3)))[1]),
-        "side_branch_cells": beside,
+        "side_branch_cells": side_cells,
         "junctions": int(
             label(np.asarray(junction_cells(diagram, sources)) & inside, np.ones((3, 3)))[1]
         ),
@@ -57,7 +67,7 @@ def between(measured: Numbers, low: float, high: float) -> np.ndarray:
 
 
 def claims(measured: dict[str, Numbers]) -> Numbers:
-    """What the paper says of Fig. 6, as far as it holds; in the middle means within a cell."""
+    """Whether the paper's statements on Fig. 6 hold; in the middle means within a cell."""
     a, b, c, d = (measured[name] for name in WORLDS)
     bend, shift = between(b, 2.5, 3.5).min(), between(c, 2.5, 3.0).mean()
     return {
@@ -75,14 +85,15 @@ def claims(measured: dict[str, Numbers]) -> Numbers:
 
 
 def compute() -> Numbers:
-    """Diagram of each world in each mode, what is measured of it, and the paper's claims."""
+    """Diagram of each world in each label mode, measurements on it, and the paper's claims."""
     numbers: Numbers = {"claims": {}, "measured": {}, "pictures": {}}
     for mode in MODES:
-        seen = {name: look(name, mode) for name in WORLDS}
-        measured = {name: measure(*pair) for name, pair in seen.items()}
-        numbers["claims"][mode] = claims(measured)
-        numbers["measured"][mode] = measured
-        numbers["pictures"][mode] = {name: picture(*pair, WINDOW) for name, pair in seen.items()}
+        key = LABEL_KEYS[mode]
+        diagrams = {name: local_diagram(name, mode) for name in WORLDS}
+        measured = {name: measure(*pair) for name, pair in diagrams.items()}
+        numbers["claims"][key] = claims(measured)
+        numbers["measured"][key] = measured
+        numbers["pictures"][key] = {name: picture(*pair, WINDOW) for name, pair in diagrams.items()}
     return numbers
 
 
@@ -91,7 +102,7 @@ def draw(numbers: Numbers, path: Path) -> None:
     figure, axes = canvas(9.4, 7.2, len(MODES), len(WORLDS))
     for column, (name, title) in enumerate(WORLDS.items()):
         for row, mode in enumerate(MODES):
-            draw_picture(axes[row, column], numbers["pictures"][mode][name])
+            draw_picture(axes[row, column], numbers["pictures"][LABEL_KEYS[mode]][name])
         axes[0, column].set_title(title)
     for row, mode in enumerate(MODES):
         axes[row, 0].set_ylabel(f"labels: {mode}\nx, ahead [m]")
@@ -100,10 +111,10 @@ def draw(numbers: Numbers, path: Path) -> None:
     figure.savefig(path)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
-    given = parse(__doc__)
-    save(given.out, "fig06_local", compute(), draw)
+    args = parse(__doc__, argv)
+    save(args.out, "fig06_local", compute(), draw)
 
 
 if __name__ == "__main__":

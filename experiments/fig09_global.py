@@ -1,15 +1,17 @@
 """Figs. 8 and 9 of the paper: the topological map of a room, grown scan by scan.
 
-The robot looks at the 6 m x 5 m room from ten places, goes from one to the next by its noisy
-odometry, and adds the local map of each scan to the global one. The map at the end is compared
-with the Voronoi graph of the full room, which is made from its walls, without a robot.
+The robot scans the 6 m x 5 m room from ten poses, moves from one to the next by its noisy odometry,
+and adds the local map of each scan to the global one. The map at the end is compared with the
+Voronoi graph of the full room, which is computed from its walls, without a robot.
 
-Ten scans see most junctions once or twice, so that here a landmark counts from its first sighting
-(`confirm=1`) and is trusted sooner (`features`), which leaves it up to 6 cm off, as the filter is told
-(`RANGE`, `BEARING`); two junctions of the room are 0.25 m apart, so that `apart` is less than that.
-The ten places were chosen for what can be seen from them: JSON also says what other draws of the
-noise give, and what places do that are moved a little.
+Ten scans see most junctions once or twice. So here a landmark counts from its first observation
+(`confirm_count=1`) and is trusted sooner (`FeatureSpec`), which leaves it up to 6 cm off; the
+filter assumes so (`RANGE_STD`, `BEARING_STD`). Two junctions of the room are 0.25 m apart, so
+`min_separation` is less than that. The ten poses were chosen for what can be seen from them: the
+JSON file also has the results for other draws of the noise, and for poses that are slightly moved.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +22,14 @@ from experiments.common import Numbers, parse, save
 from experiments.fig09_picture import draw
 from experiments.room_graph import reference
 from jaxslam.core import polylines
+from jaxslam.core.features import Features
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.scan import Scan
 from jaxslam.core.se2 import relative, transform
-from jaxslam.core.types import JUNCTION
-from jaxslam.filtering import config, slam_filter
-from jaxslam.filtering.config import FilterConfig
+from jaxslam.core.types import JUNCTION, Array, Key
+from jaxslam.filtering import slam_filter
+from jaxslam.filtering.config import FilterConfig, init
 from jaxslam.filtering.data_association import AssociationSpec
 from jaxslam.filtering.motion_model import odometry_cov, wheel_coefficients
 from jaxslam.filtering.noise import NoiseParams
@@ -33,6 +37,7 @@ from jaxslam.frontend import extract, voronoi
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import centres
+from jaxslam.frontend.local_graph import LocalArcs
 from jaxslam.mapping import arc_table, topological_map
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import worlds
@@ -42,47 +47,44 @@ from jaxslam.simulation.worlds import World
 
 WORLD = "fig07"
 CONFIG = Config(
-    filter=FilterConfig(
-        confirm_count=1,
-        association=AssociationSpec(min_separation=0.15),
-    ),
-    frontend=FrontendConfig(
-        features=FeatureSpec(min_seen_fraction=0.5, max_hidden_depth=0.3),
-    ),
+    frontend=FrontendConfig(features=FeatureSpec(min_seen_fraction=0.5, max_hidden_depth=0.3)),
+    filter=FilterConfig(confirm_count=1, association=AssociationSpec(min_separation=0.15)),
 )
-RANGE, BEARING = 0.02, 0.01  # [m], [rad] standard deviation of nodes beyond their own
+RANGE_STD, BEARING_STD = 0.02, 0.01  # [m], [rad] of nodes, beyond their own
 NEAR = 0.1  # [m] a node of the map this close to a junction is that junction
-SHIFT = (0.05, 0.05, 0.05)  # [m, m, rad] standard deviation of places that are moved
+SHIFT = (0.05, 0.05, 0.05)  # [m, m, rad] standard deviation of poses that are moved
 
 
 @jax.jit
-def scans_from(poses: jax.Array, walls: jax.Array, key: jax.Array):
+def scans_from(key: Key, poses: Array, walls: Array) -> Scan:
     """Noisy scans [T] of the walls (S, 4) from poses (T, 3)."""
-    look = lambda pose, own: add_range_noise(
-        own, CONFIG.frontend.lidar, cast(CONFIG.frontend.lidar, World(walls), pose)
-    )
-    return jax.vmap(look)(poses, jax.random.split(key, poses.shape[0]))
+    lidar = CONFIG.frontend.lidar
+
+    def noisy_scan(key: Key, pose: Array) -> Scan:
+        return add_range_noise(key, lidar, cast(lidar, World(walls), pose))
+
+    return jax.vmap(noisy_scan)(jax.random.split(key, poses.shape[0]), poses)
 
 
-def odometry(places: np.ndarray, robot: Robot, seed: int) -> np.ndarray:
-    """What the encoders say (T, 3) of the way between successive places (T, 3)."""
-    told, random = [np.zeros(3)], np.random.default_rng(seed)
-    for a, b in zip(jnp.asarray(places[:-1], float), jnp.asarray(places[1:], float), strict=True):
-        motion = relative(a, b)
-        cov = np.asarray(odometry_cov(wheel_coefficients(*robot), motion), np.float64)
-        told.append(random.multivariate_normal(np.asarray(motion), (cov + cov.T) / 2))
-    return np.array(told)
+def noisy_odometry(poses: np.ndarray, robot: Robot, seed: int) -> np.ndarray:
+    """Odometry increments (T, 3) of the encoders between successive poses (T, 3)."""
+    increments, random = [np.zeros(3)], np.random.default_rng(seed)
+    for a, b in zip(jnp.asarray(poses[:-1], float), jnp.asarray(poses[1:], float), strict=True):
+        exact = relative(a, b)
+        cov = np.asarray(odometry_cov(wheel_coefficients(*robot), exact), np.float64)
+        increments.append(random.multivariate_normal(np.asarray(exact), (cov + cov.T) / 2))
+    return np.array(increments)
 
 
 step = jax.jit(slam_filter.step, static_argnums=0)
-add = jax.jit(arc_table.add_scan_arcs, static_argnames="lidar")
+add_scan_arcs = jax.jit(arc_table.add_scan_arcs, static_argnames="lidar")
 
 
 @jax.jit
-def branch_cells(scans):
+def branch_cells(scans: Scan) -> Array:
     """Cells [T] (H, W) bool of the branches of each local diagram."""
 
-    def one(scan):
+    def one(scan: Scan) -> Array:
         _, diagram, sources = extract.extract_diagram(CONFIG.frontend, scan)
         return voronoi.branch_cells(diagram, sources)
 
@@ -90,45 +92,43 @@ def branch_cells(scans):
 
 
 def explore(
-    places: np.ndarray, walls: np.ndarray, seed: int
-) -> tuple[list[Numbers], np.ndarray, tuple]:
-    """Scan from each place, and add each local map to the global one at once.
+    scan_poses: np.ndarray, walls: np.ndarray, seed: int
+) -> tuple[list[Numbers], np.ndarray, tuple[Scan, Features, LocalArcs]]:
+    """Scan from each pose, and add each local map to the global one at once.
 
     Returns:
         The global map after each scan, the estimated poses (T, 3), and the scans with their local
         maps.
     """
     robot = Robot()
-    poses = jnp.asarray(places, float)
-    noise = NoiseParams.for_simulated_robot(*robot)._replace(
-        range_std=jnp.asarray(RANGE, float), bearing_std=jnp.asarray(BEARING, float)
+    poses = jnp.asarray(scan_poses, float)
+    params = NoiseParams.for_simulated_robot(*robot)._replace(
+        range_std=jnp.asarray(RANGE_STD, float), bearing_std=jnp.asarray(BEARING_STD, float)
     )
-    scans = scans_from(poses, jnp.asarray(walls, float), jax.random.key(seed))
-    told = jnp.asarray(odometry(places, robot, seed), float)
-    seen, links = extract.extract_local_graphs(CONFIG.frontend, scans)
-    belief, arcs = (
-        config.init(CONFIG.filter, poses[0]),
-        arc_table.empty_arcs(capacity=2 * CONFIG.filter.max_landmarks),
-    )
-    maps, way = [], []
-    for t in range(len(places)):
-        nodes, branch, scan = jax.tree.map(lambda x, t=t: x[t], (seen, links, scans))
-        belief, info = step(CONFIG, noise, belief, Measurement(told[t], nodes))
-        arcs = add(arcs, info.id, info.pose, branch, scan, lidar=CONFIG.frontend.lidar)
-        way.append(np.asarray(info.pose))
+    scans = scans_from(jax.random.key(seed), poses, jnp.asarray(walls, float))
+    increments = jnp.asarray(noisy_odometry(scan_poses, robot, seed), float)
+    features, local_arcs = extract.extract_local_graphs(CONFIG.frontend, scans)
+    belief = init(CONFIG.filter, poses[0])
+    arcs = arc_table.empty_arcs(capacity=2 * CONFIG.filter.max_landmarks)
+    maps, estimates = [], []
+    for t in range(len(scan_poses)):
+        own, own_arcs, scan = jax.tree.map(lambda x, t=t: x[t], (features, local_arcs, scans))
+        belief, info = step(CONFIG.filter, params, belief, Measurement(increments[t], own))
+        arcs = add_scan_arcs(CONFIG.frontend.lidar, arcs, info.id, info.pose, own_arcs, scan)
+        estimates.append(np.asarray(info.pose))
         graph = topological_map.build_map(
             belief,
             arcs,
-            np.array(way),
+            np.array(estimates),
             confirm_count=CONFIG.filter.confirm_count,
             min_separation=CONFIG.filter.association.min_separation,
         )
         maps.append(plain_map(graph))
-    return maps, np.array(way), (scans, seen, links)
+    return maps, np.array(estimates), (scans, features, local_arcs)
 
 
 def plain_map(graph: TopologicalMap) -> Numbers:
-    """Nodes and arcs of a map, without its corners."""
+    """The nodes and arcs of a map, without its corners."""
     nodes = np.flatnonzero(graph.kind == JUNCTION)
     rank = {int(n): k for k, n in enumerate(nodes)}
     return {
@@ -144,25 +144,32 @@ def plain_map(graph: TopologicalMap) -> Numbers:
     }
 
 
-def local_views(way: np.ndarray, scans, seen, links) -> list[Numbers]:
-    """What each scan adds, in the map's frame: branch cells, junctions and arcs between them."""
+def local_views(
+    estimates: np.ndarray, scans: Scan, features: Features, local_arcs: LocalArcs
+) -> list[Numbers]:
+    """What each scan adds, in the map frame: branch cells, junctions and arcs between them."""
     cells, views = np.asarray(branch_cells(scans)), []
-    middle = np.asarray(centres(CONFIG.frontend.grid))
-    for t, pose in enumerate(way):
-        place = lambda xy, pose=pose: np.asarray(transform(jnp.asarray(pose), jnp.asarray(xy)))
-        keep = np.asarray(seen.valid[t] & (seen.kind[t] == JUNCTION))
+    centre = np.asarray(centres(CONFIG.frontend.grid))
+    for t, pose in enumerate(estimates):
+        keep = np.asarray(features.valid[t] & (features.kind[t] == JUNCTION))
+        complete = local_arcs.valid[t] & (local_arcs.pair[t, :, 1] >= 0)
         views.append(
             {
-                "branches": place(middle[cells[t]]).round(2),
-                "nodes": place(seen.xy[t])[keep].round(3),
-                "arcs": int(np.sum(links.valid[t] & (links.pair[t, :, 1] >= 0))),
+                "branches": _in_map(pose, centre[cells[t]]).round(2),
+                "nodes": _in_map(pose, features.xy[t])[keep].round(3),
+                "arcs": int(np.sum(complete)),
             }
         )
     return views
 
 
+def _in_map(pose: np.ndarray, points: Any) -> np.ndarray:
+    """Points (N, 2) of the base_link frame at `pose` (3,), in the map frame."""
+    return np.asarray(transform(jnp.asarray(pose), jnp.asarray(points)))
+
+
 def compare(found: Numbers, true: Numbers) -> Numbers:
-    """Nodes and arcs of a map against junctions and branches of the full room."""
+    """Compare nodes and arcs of a map with junctions and branches of the full room."""
     junctions = np.array([j["xy"] for j in true["junctions"]])
     xy = np.asarray(found["xy"]).reshape(-1, 2)
     away = np.linalg.norm(xy[:, None] - junctions[None], axis=2)
@@ -210,19 +217,23 @@ def middle_and_worst(errors: list[float]) -> Numbers:
     return {"median": round(float(np.median(errors)), 4), "max": round(float(max(errors)), 4)}
 
 
-def repeat(places: np.ndarray, walls: np.ndarray, true: Numbers, seeds: range, shift) -> Numbers:
-    """Means of the comparison over other draws of the noise, the places moved by `shift` (3,)."""
+def repeat(
+    scan_poses: np.ndarray, walls: np.ndarray, true: Numbers, seeds: range, shift: np.ndarray
+) -> Numbers:
+    """Means of the comparison over other draws of the noise, the poses moved by `shift` (3,)."""
     results = []
     for seed in seeds:
-        moved = places + np.random.default_rng(seed).normal(size=places.shape) * shift
+        moved = scan_poses + np.random.default_rng(seed).normal(size=scan_poses.shape) * shift
         results.append(compare(explore(moved, walls, seed)[0][-1], true))
-    count = lambda key: [len(r[key]) if isinstance(r[key], list) else r[key] for r in results]
-    keys = ["nodes_found", "nodes_spurious", "arcs_found", "arcs_spurious"]
+    counts = {
+        key: [len(r[key]) if isinstance(r[key], list) else r[key] for r in results]
+        for key in ("nodes_found", "nodes_spurious", "arcs_found", "arcs_spurious")
+    }
     worst = [r["position_error_m"]["max"] for r in results if r["nodes_found"]]
-    whole = [n == len(true["junctions"]) for n in count("nodes_found")]
+    whole = [n == len(true["junctions"]) for n in counts["nodes_found"]]
     return {
         "runs": len(results),
-        **{f"{key}_mean": float(np.mean(count(key))) for key in keys},
+        **{f"{key}_mean": float(np.mean(count)) for key, count in counts.items()},
         "runs_with_all_nodes": int(np.sum(whole)),
         "runs_equal": sum(equal(r) for r in results),
         "position_error_max_m": max(worst, default=None),
@@ -235,38 +246,37 @@ def equal(result: Numbers) -> bool:
     return not any(result[key] for key in keys)
 
 
-def compute(seed: int, runs: int) -> Numbers:
+def compute(seed: int, num_trials: int) -> Numbers:
     """The maps scan by scan, the reference, and how they compare."""
-    places, walls = worlds.scan_poses(WORLD), np.asarray(worlds.named(WORLD).walls)
+    scan_poses, walls = worlds.scan_poses(WORLD), np.asarray(worlds.named(WORLD).walls)
     true = reference(walls)
-    maps, way, local = explore(places, walls, seed)
+    maps, estimates, local = explore(scan_poses, walls, seed)
     result = compare(maps[-1], true)
-    others = range(seed + 1, seed + 1 + runs)
+    others = range(seed + 1, seed + 1 + num_trials)
     return {
         "equals_the_voronoi_graph_of_the_room": equal(result),
         **{key: result[key] for key in ("worst_node_error_m", "extra_arcs", "missing_arcs")},
         "near_m": NEAR,
         "comparison": result,
-        "other_noise": repeat(places, walls, true, others, np.zeros(3)),
+        "other_noise": repeat(scan_poses, walls, true, others, np.zeros(3)),
         "places_moved": {"std_m_m_rad": SHIFT}
-        | repeat(places, walls, true, others, np.array(SHIFT)),
+        | repeat(scan_poses, walls, true, others, np.array(SHIFT)),
         "nodes_in_map": [len(m["xy"]) for m in maps],
         "arcs_in_map": [len(m["arcs"]) for m in maps],
-        "pose_error_m": np.hypot(*(way - places)[:, :2].T).round(4),
-        "places": places,
-        "estimates": way.round(4),
+        "pose_error_m": np.hypot(*(estimates - scan_poses)[:, :2].T).round(4),
+        "places": scan_poses,
+        "estimates": estimates.round(4),
         "walls": walls,
         "reference": true,
         "maps": maps,
-        "local": local_views(way, *local),
+        "local": local_views(estimates, *local),
     }
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Run the experiment."""
-    given = parse(__doc__, runs=12)
-    numbers = compute(given.seed, given.frontend.segments)
-    save(given.out, "fig09_global", numbers, draw)
+    args = parse(__doc__, argv, runs=12)
+    save(args.out, "fig09_global", compute(args.seed, args.runs), draw)
 
 
 if __name__ == "__main__":

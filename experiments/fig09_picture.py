@@ -1,4 +1,4 @@
-"""Picture of the topological map of a room as it grows: what `fig09_global` has computed."""
+"""Picture of the topological map of a room as it grows, as computed by `fig09_global`."""
 
 from pathlib import Path
 
@@ -15,12 +15,21 @@ def draw_walls(axis, numbers: Numbers) -> None:
 
 
 def draw_robot(axis, pose: list[float], size: float) -> None:
-    """Draw the robot as an arrow of length `size` [m] in the direction it looks."""
+    """Draw the robot as an arrow of length `size` [m] along its heading."""
     x, y, heading = pose
-    ahead = size * np.cos(heading), size * np.sin(heading)
-    style = {"color": RED, "width": 0.12 * size, "head_width": 0.55 * size}
-    style |= {"head_length": 0.45 * size, "length_includes_head": True}
-    axis.arrow(x, y, *ahead, zorder=4, linewidth=0, **style)
+    axis.arrow(
+        x,
+        y,
+        size * np.cos(heading),
+        size * np.sin(heading),
+        color=RED,
+        width=0.12 * size,
+        head_width=0.55 * size,
+        head_length=0.45 * size,
+        length_includes_head=True,
+        linewidth=0,
+        zorder=4,
+    )
 
 
 def draw_map(axis, found: Numbers, width: float, size: float) -> None:
@@ -32,13 +41,20 @@ def draw_map(axis, found: Numbers, width: float, size: float) -> None:
             *np.array(line).T, color=GREEN, linewidth=width, linestyle=dashes, label=label, zorder=2
         )
     for line in found["frontiers"]:
-        label = "way into what was not seen"
+        label = "open frontier"
         axis.plot(*np.array(line).T, color=PINK, linewidth=width / 2, label=label, zorder=1.5)
         axis.plot(*line[-1], "x", color=PINK, markersize=size, zorder=3)
     if found["xy"]:
-        style = {"markersize": size, "markeredgecolor": "white", "markeredgewidth": 0.5}
-        nodes = np.array(found["xy"]).T
-        axis.plot(*nodes, "o", color=GREEN, label="node of the map", zorder=3, **style)
+        axis.plot(
+            *np.array(found["xy"]).T,
+            "o",
+            color=GREEN,
+            markersize=size,
+            markeredgecolor="white",
+            markeredgewidth=0.5,
+            label="node of the map",
+            zorder=3,
+        )
 
 
 def draw_step(axis, numbers: Numbers, t: int) -> None:
@@ -70,8 +86,8 @@ def draw_whole(axis, numbers: Numbers) -> None:
         rim = np.array(junction["xy"])[:, None] + near * np.array([np.cos(ring), np.sin(ring)])
         axis.plot(*rim, color=BLACK, linewidth=1.1, label=label)
     draw_map(axis, numbers["maps"][-1], 1.8, 6)
-    way = np.array(numbers["places"])[:, :2].T
-    axis.plot(*way, color=BLUE, linewidth=0.7, linestyle=":", label="way between the places")
+    path = np.array(numbers["places"])[:, :2].T
+    axis.plot(*path, color=BLUE, linewidth=0.7, linestyle=":", label="path between the scan poses")
     for t, pose in enumerate(numbers["estimates"]):
         draw_robot(axis, pose, 0.28)
         axis.annotate(f"{t + 1}", pose[:2], (-9, -9), textcoords="offset points", fontsize=8)
@@ -103,7 +119,7 @@ def draw(numbers: Numbers, path: Path) -> None:
     lower.legend(unique.values(), unique.keys(), loc="outside right center", frameon=False)
     upper.suptitle(
         "light blue: branches of the local diagram; rings: its junctions; green: the map so far; "
-        "arrow: where the robot looks",
+        "arrow: the robot",
         fontsize=10,
     )
     figure.savefig(path)

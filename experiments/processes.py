@@ -1,7 +1,7 @@
 """One piece of work by several processes, on this machine or on many, joined by `jax.distributed`.
 
-JAX ends a process that has lost another by an abort. So each runs below one that uses no JAX, which
-tells what happened in one line, and leaves no process behind.
+JAX ends a process that has lost another by an abort. So each is the child of one that uses no JAX,
+which reports what happened in one line, and leaves no process behind.
 """
 
 import os
@@ -23,21 +23,27 @@ import jax
 from jaxslam.core.devices import num_cores, use_cpu_devices
 from jaxslam.io.errors import InputError
 
-WAIT = 45.0  # [s] in which all processes must have come up
+STARTUP_TIMEOUT = 45.0  # [s] in which all processes must have started
 HEARTBEAT = 20  # [s] without a sign of life after which a process is lost
 LOOPBACK = "127.0.0.1"
 
 
 class Group(NamedTuple):
-    """Processes that work together, and which of them are started here."""
+    """Processes that work together, and which of them are started here.
 
-    address: str  # HOST:PORT at which process 0 coordinates them
+    Attributes:
+        address: HOST:PORT at which process 0 coordinates them.
+        count: Number of processes.
+        own: Numbers of those started here.
+    """
+
+    address: str
     count: int
-    own: Sequence[int]  # numbers of those started here
+    own: Sequence[int]
 
 
-class Lost(RuntimeError):
-    """A process did not come up, or ended early."""
+class LostProcessError(RuntimeError):
+    """A process did not start, or ended early."""
 
 
 def local(count: int) -> Group:
@@ -47,68 +53,68 @@ def local(count: int) -> Group:
         return Group(f"{LOOPBACK}:{free.getsockname()[1]}", count, range(count))
 
 
-def run(group: Group, work: Callable, *given: Any) -> list[Any]:
-    """Call `work(*given, say=...)` in every process; return what it returned in those of here.
+def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
+    """Call `work(*arguments, stream=...)` in every process; return the results of those of here.
 
     Args:
         group: The processes.
-        work: A function of a module. It may write to the stream `say`; whatever else is printed
-            goes to a file.
-        given: Its arguments.
+        work: A function of a module. It may write to `stream`; everything else that it prints goes
+            to a log file.
+        arguments: Its arguments.
 
     Raises:
-        Lost: One of them did not come up, or has ended early; the others are ended too.
+        LostProcessError: One of them did not start, or has ended early; the others are ended too.
         InputError: The work has refused its input.
     """
     spawn = get_context("spawn")
     cores = max(1, num_cores() // len(group.own))
     logs = Path(tempfile.mkdtemp(prefix="processes-"))
     children, results = {}, {}
-    # Ctrl-C reaches all processes of a terminal, and is for this one.
-    kept = _ignore_interrupts()
+    # Ctrl-C reaches all processes of a terminal; only this one handles it.
+    handler = _ignore_interrupts()
     try:
         for number in group.own:
             here, there = spawn.Pipe(duplex=False)
             log = logs / f"{number}.txt"
-            arguments = (work, given, group, number, cores, WAIT, there, log)
-            child = spawn.Process(target=_child, args=arguments)
+            task = (work, arguments, group, number, cores, STARTUP_TIMEOUT, there, log)
+            child = spawn.Process(target=_child, args=task)
             child.start()
             there.close()
             children[number] = (child, here)
     finally:
-        _restore_interrupts(kept)
-    told = False  # where the logs are
+        _restore_interrupts(handler)
+    keep_logs = False
     try:
-        _follow(group, children, results, monotonic() + WAIT, logs)
-    except Lost as error:
-        told = str(logs) in str(error)
+        _follow(group, children, results, monotonic() + STARTUP_TIMEOUT, logs)
+    except LostProcessError as error:
+        keep_logs = str(logs) in str(error)
         raise
     finally:
         for child, _ in children.values():
             child.kill()
             child.join()
-        if not told:
+        if not keep_logs:
             shutil.rmtree(logs, ignore_errors=True)
     return [results[number] for number in group.own]
 
 
 def _follow(group: Group, children: dict, results: dict, deadline: float, logs: Path) -> None:
-    """Collect results of the children until all are there, or one is lost."""
-    up = set()
-    while open_ := {k: c for k, c in children.items() if k not in results}:
-        left = None if len(up) == len(children) else max(0.0, deadline - monotonic())
-        waited = [x for child, pipe in open_.values() for x in (child.sentinel, pipe)]
-        if not connection.wait(waited, left):
+    """Collect results of the children until all are complete, or one is lost."""
+    started = set()
+    while pending := {k: c for k, c in children.items() if k not in results}:
+        left = None if len(started) == len(children) else max(0.0, deadline - monotonic())
+        events = [x for child, pipe in pending.values() for x in (child.sentinel, pipe)]
+        if not connection.wait(events, left):
             raise _missing(group)
         ended = []
-        for number, (child, pipe) in open_.items():
-            gone = not child.is_alive()  # what it has said before counts
-            for what, value in _heard(pipe):
-                if what == "up":
-                    up.add(number)
-                elif what == "done":
+        for number, (child, pipe) in pending.items():
+            gone = not child.is_alive()  # messages that it sent before count
+            for kind, value in _messages(pipe):
+                if kind == "started":
+                    started.add(number)
+                elif kind == "done":
                     results[number] = value
-                elif what == "refused":
+                elif kind == "refused":
                     raise InputError(value)
                 else:
                     ended.append((number, value))
@@ -116,39 +122,41 @@ def _follow(group: Group, children: dict, results: dict, deadline: float, logs: 
                 child.join()
                 ended.append((number, child.exitcode))
         if ended:
-            raise _early(group, ended, up, logs)
+            raise _early(group, ended, started, logs)
 
 
-def _early(group: Group, ended: list, up: set[int], logs: Path) -> Lost:
-    """What to say of processes that ended early, each with its error or exit code."""
-    # An abort is how JAX ends those that have lost another, or have found none.
+def _early(group: Group, ended: list, started: set[int], logs: Path) -> LostProcessError:
+    """Error for processes that ended early, each with its error or exit code."""
+    # By an abort JAX ends those that have lost another, or have found none.
     number, why = min(ended, key=lambda one: (one[1] == -signal.SIGABRT, isinstance(one[1], int)))
     if why == -signal.SIGABRT:
-        if number not in up:
+        if number not in started:
             return _missing(group)
         why = "it has lost another one"
     why = f"exit code {why}" if isinstance(why, int) else why
-    return Lost(f"process {number} of {group.count} ended early ({why}); see {logs}")
+    return LostProcessError(f"process {number} of {group.count} ended early ({why}); see {logs}")
 
 
-def _missing(group: Group) -> Lost:
-    return Lost(f"not all of {group.count} processes came up at {group.address}; start every one")
+def _missing(group: Group) -> LostProcessError:
+    return LostProcessError(
+        f"not all of {group.count} processes came up at {group.address}; start every one"
+    )
 
 
-def _heard(pipe: connection.Connection) -> list[tuple[str, Any]]:
-    """What a process has said since."""
-    heard = []
+def _messages(pipe: connection.Connection) -> list[tuple[str, Any]]:
+    """New messages of a process: kind and value."""
+    messages = []
     try:
         while pipe.poll():
-            heard.append(pipe.recv())
+            messages.append(pipe.recv())
     except (EOFError, OSError):
         pass
-    return heard
+    return messages
 
 
 def _child(
     work: Callable,
-    given: tuple,
+    arguments: tuple,
     group: Group,
     number: int,
     cores: int,
@@ -156,12 +164,12 @@ def _child(
     pipe: connection.Connection,
     log: Path,
 ) -> None:
-    """One process: join the others, work, tell the parent."""
+    """One process: join the others, work, send the result to the parent."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    say = os.fdopen(os.dup(2), "w") if number == min(group.own) else open(os.devnull, "w")
-    into = os.open(log, os.O_WRONLY | os.O_CREAT)
-    for stream in (1, 2):
-        os.dup2(into, stream)
+    stream = os.fdopen(os.dup(2), "w") if number == min(group.own) else open(os.devnull, "w")
+    log_file = os.open(log, os.O_WRONLY | os.O_CREAT)
+    for descriptor in (1, 2):
+        os.dup2(log_file, descriptor)
     try:
         use_cpu_devices(cores)
         bind = group.address if group.address.startswith(LOOPBACK) else None
@@ -175,10 +183,10 @@ def _child(
             coordinator_bind_address=bind,
         )
         jax.devices()
-        pipe.send(("up", None))
-        result = work(*given, say=say)
+        pipe.send(("started", None))
+        result = work(*arguments, stream=stream)
         jax.distributed.shutdown()
-        say.close()
+        stream.close()
         pipe.send(("done", result))
     except InputError as error:
         _leave(pipe, ("refused", str(error)))
@@ -201,12 +209,12 @@ def _end_with_parent() -> None:
 
 
 def _ignore_interrupts() -> Any:
-    """Ignore Ctrl-C, where that is possible; returns what did not."""
+    """Ignore Ctrl-C, where that is possible; returns the handler before."""
     if threading.current_thread() is not threading.main_thread():
         return None
     return signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _restore_interrupts(kept: Any) -> None:
-    if kept is not None:
-        signal.signal(signal.SIGINT, kept)
+def _restore_interrupts(handler: Any) -> None:
+    if handler is not None:
+        signal.signal(signal.SIGINT, handler)

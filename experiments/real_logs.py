@@ -1,16 +1,18 @@
-"""Recorded logs: what aligned scans, each kind of landmark and tuned noise are worth.
+"""Recorded logs: ablation of scan matching, of landmark types and of tuned noise.
 
-Every log in the folder `--data`, and MIT's Killian Court where `.[data]` is installed, by one set
-of defaults. `NAME.reference.tum` and `NAME.relations` beside `NAME.clf` are what it is judged by.
-Odometry is that of the wheels, or of scans aligned to those before and fused with the wheels. Tuned
-noise is tuned on the other logs that have a reference, never on the one it is judged on. Errors are
-those of the smoothed way, which is what a run leaves, and of the filter's, which was known as the
-robot went; NEES is the filter's, of errors since the first scan. References are made by other
-programs: some centimetres of an error are theirs.
+Every log in the folder `--data`, and MIT's Killian Court where `.[data]` is installed, with one set
+of defaults. `NAME.reference.tum` and `NAME.relations` beside `NAME.clf` are the references.
+Odometry is that of the wheels, or that of the wheels fused with scan matching. Tuned noise is tuned
+on the other logs that have a reference, never on the one it is evaluated on. Errors are those of
+the smoothed trajectory, which is the result of a run, and of the filter's online estimates; NEES is
+the filter's, of errors since the first scan. The references are computed by other programs and are
+themselves some centimetres off.
 """
 
 import sys
 from collections.abc import Sequence
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,13 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from experiments import common, one_core
-from jaxslam.cli.options import enable_caches
-from jaxslam.core import episode
-from jaxslam.core.episode import Episode
+from experiments import common, timing
+from jaxslam.core.caches import enable_caches
+from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.features import restrict_features
 from jaxslam.core.logs import LaserLog, Relations
-from jaxslam.core.se2_np import relative
+from jaxslam.core.se2_np import increments, relative
 from jaxslam.core.time_series import match_times
 from jaxslam.core.types import CORNER, JUNCTION, WALL
 from jaxslam.evaluation import log_errors
@@ -34,11 +35,10 @@ from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import confirmed, init
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
-from jaxslam.io import readers, tum
+from jaxslam.io import readers, relations, tum
 from jaxslam.io.errors import InputError
-from jaxslam.io.relations import read
 from jaxslam.pipeline import episodes, offline
-from jaxslam.pipeline.config import MAX_LANDMARKS, Config
+from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import SlamResult
 from jaxslam.tuning import fitting
 
@@ -51,28 +51,46 @@ LANDMARKS = {
     "all": (JUNCTION, CORNER, WALL),
 }
 ODOMETRY = ("wheels", "scan")
-STEPS = 12  # of tuning
+NUM_UPDATES = 12  # of tuning
+STYLES = {  # of trajectories: colour, dashes, width
+    "reference": (common.BLACK, "--", 1.0),
+    "estimate": (common.SKY, "-", 2.5),
+    "wheels": (common.RED, ":", 0.8),
+}
 
 
-class Known(NamedTuple):
-    """A log, and what is known of the way of its robot."""
+class Log(NamedTuple):
+    """A log, and the references for its trajectory.
+
+    Attributes:
+        name: Of its file.
+        laser_log: Scans and odometry.
+        reference: Reference trajectory, if there is one.
+        relations: Verified relative poses, if there are any.
+    """
 
     name: str
-    recording: LaserLog
+    laser_log: LaserLog
     reference: Trajectory | None
     relations: Relations | None
 
 
-class Seen(NamedTuple):
-    """What the filter is given of a log."""
+class Extracted(NamedTuple):
+    """Filter input of a log.
+
+    Attributes:
+        config: For the scanner of the log, with a map of the size that it needed.
+        episode: With scan matches; the ground truth is the reference since the first scan.
+        ms: Milliseconds per scan on one core, from ranges to the smoothed map, by odometry.
+    """
 
     config: Config
-    log: Episode  # with its motions aligned; the truth is the reference since the first scan
-    ms: dict[str, float]  # a scan, one core, from ranges to the smoothed map, by odometry
+    episode: Episode
+    ms: dict[str, float]
 
 
-def find(folder: Path | None) -> list[Known]:
-    """The logs of a folder, and those that packages bring."""
+def find_logs(folder: Path | None) -> list[Log]:
+    """The logs of a folder, and those of installed packages."""
     files = sorted(folder.rglob("*")) if folder else []
     paths = {
         path.name.split(".")[0]: path
@@ -81,7 +99,7 @@ def find(folder: Path | None) -> list[Known]:
     }
     for name in readers.NAMED_LOGS:
         try:
-            paths[name] = readers.find(name)
+            paths[name] = readers.find_log(name)
         except InputError as error:
             print(f"left out: {error}")
 
@@ -89,177 +107,177 @@ def find(folder: Path | None) -> list[Known]:
         own = [file for file in files if file.name.endswith(f"{name}{ending}")]
         return own[0] if own else None
 
-    found = []
+    logs = []
     for name, path in paths.items():
         reference, pairs = beside(name, ".reference.tum"), beside(name, ".relations")
-        one = Known(
+        log = Log(
             name,
-            readers.read(path),
+            readers.read_log(path),
             None if reference is None else tum.read(reference),
-            None if pairs is None else read(pairs),
+            None if pairs is None else relations.read(pairs),
         )
-        found.append(one)
-    return found
+        logs.append(log)
+    return logs
 
 
-def look(known: Known) -> Seen:
-    """Features and aligned motions of a log, and what mapping it costs on one core."""
-    recording = known.recording
-    config = episodes.laser_log_config([recording])._replace(
-        filter=episodes.laser_log_config([recording]).filter._replace(
-            max_landmarks=MAX_LANDMARKS,
-        ),
+def extract(log: Log) -> Extracted:
+    """Features and scan matches of a log, and the time to map it on one core."""
+    laser_log = log.laser_log
+    config = Config.for_laser_log(laser_log.lidar)
+    odometry = increments(laser_log.odom_poses)
+    truth, truth_mask = np.zeros(odometry.shape, np.float32), np.zeros(len(odometry), bool)
+    if log.reference is not None:
+        i, j = match_times(laser_log.times, log.reference[0]).T
+        truth[i] = relative(log.reference[1][j[0]], log.reference[1][j])
+        truth_mask[i] = True
+    results: dict[str, SlamResult] = {}
+
+    def run(source: str) -> None:
+        match_scans = source == "scan"
+        params = NoiseParams.for_laser_log(match_scans=match_scans)
+        results[source] = offline.run_slam(
+            config, params, odometry, laser_log.ranges, match_scans=match_scans, smooth=True
+        )
+
+    timing.pin()
+    taken = timing.fastest({source: (run, source) for source in ODOMETRY}, repeats=1)
+    timing.unpin()
+    found = results["scan"]
+    capacity = found.belief.num_seen.size  # what it grew to
+    config = config._replace(filter=config.filter._replace(max_landmarks=capacity))
+    episode = Episode(
+        truth, odometry, found.features, truth_mask=truth_mask, scan_matches=found.scan_matches
     )
-    motion = episodes.odometry_increments(recording.odom_poses)
-    scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(recording.ranges, float))
-    truth, judged = np.zeros(motion.shape, np.float32), np.zeros(len(motion), bool)
-    if known.reference is not None:
-        i, j = match_times(recording.times, known.reference[0]).T
-        truth[i] = relative(known.reference[1][j[0]], known.reference[1][j])
-        judged[i] = True
-    surveys: dict[str, SlamResult] = {}
-
-    def survey(odometry: str) -> None:
-        by_scans = odometry == "scan"
-        given = config, NoiseParams.for_laser_log(match_scans=by_scans), jnp.zeros(3), motion, scans
-        surveys[odometry] = offline.run_slam(*given, match_scans=by_scans, smooth=True)
-
-    one_core.pin()
-    taken = one_core.least({name: (survey, name) for name in ODOMETRY}, repeats=1)
-    one_core.unpin()
-    found = surveys["scan"]
-    config = config._replace(
-        filter=config.filter._replace(
-            max_landmarks=found.belief.num_seen.size,
-        ),
-    )  # as many as it grew to
-    log = Episode(truth, motion, found.nodes, None, judged, scan_matches=found.aligned)
-    return Seen(
-        config,
-        episodes.to_numpy_precision(log),
-        {name: 1e3 * s / len(motion) for name, s in taken.items()},
-    )
+    ms = {source: 1e3 * s / len(odometry) for source, s in taken.items()}
+    return Extracted(config, episodes.to_numpy_precision(episode), ms)
 
 
-def given(log: Episode, odometry: str, landmarks: str) -> Episode:
-    """The log with some kinds of landmarks, and with its motions aligned or not."""
+def restrict(episode: Episode, odometry: str, landmarks: str) -> Episode:
+    """The episode with some landmark types, and with or without scan matches."""
     kinds = jnp.array(LANDMARKS[landmarks] or (-1,), jnp.int32)
-    some = jax.vmap(restrict_features)(log.features, jnp.isin(log.features.kind, kinds))
-    aligned = log.scan_matches if odometry == "scan" else None
-    return log._replace(features=jax.tree.map(np.asarray, some), scan_matches=aligned)
+    wanted = jnp.isin(jnp.asarray(episode.features.kind), kinds)
+    features = jax.vmap(restrict_features)(episode.features, wanted)
+    matches = episode.scan_matches if odometry == "scan" else None
+    return episode._replace(features=jax.tree.map(np.asarray, features), scan_matches=matches)
 
 
-def tuned(others: Sequence[Seen], odometry: str) -> dict[str, Any] | None:
-    """Noise tuned on the logs that have a reference; None if there are none."""
-    some = [one for one in others if one.log.truth_mask.any()]
-    if not some:
-        return None
-    together = episodes.stack_episodes([given(one.log, odometry, "all") for one in some])
-    with tqdm(total=STEPS + 1, unit="step", leave=False, desc=f"tuning, {odometry}") as bar:
-        start = NoiseParams.for_laser_log(match_scans=odometry == "scan")
-        report = lambda _: bar.update()
-        # The filter asks of the scanner no more than its field of view.
-        found = fitting.tune(some[0].config, start, together, num_updates=STEPS, callback=report)
-    return found.params._asdict()
+def tune(others: Sequence[Extracted], odometry: str) -> common.Numbers:
+    """Noise tuned on the logs that have a reference, `{"noise": None}` if there are none."""
+    usable = [one for one in others if one.episode.truth_mask.any()]
+    if not usable:
+        return {"noise": None}
+    train = episodes.stack_episodes([restrict(one.episode, odometry, "all") for one in usable])
+    start = NoiseParams.for_laser_log(match_scans=odometry == "scan")
+    with tqdm(total=NUM_UPDATES + 1, unit="update", leave=False, desc=f"tuning, {odometry}") as bar:
+        # Of the scanner, the filter uses only the field of view.
+        found = fitting.tune(
+            usable[0].config,
+            start,
+            train,
+            num_updates=NUM_UPDATES,
+            callback=lambda _: bar.update(),
+        )
+    return {"noise": found.params._asdict()}
 
 
 def row(
-    known: Known, seen: Seen, odometry: str, landmarks: str, noise: NoiseParams
+    log: Log, extracted: Extracted, odometry: str, landmarks: str, params: NoiseParams
 ) -> tuple[common.Numbers, np.ndarray]:
-    """Errors of one way to do it, and the estimated positions (T, 2)."""
-    log = given(seen.log, odometry, landmarks)
-    start = init(seen.config.filter, jnp.zeros(3))
-    inputs = episode.measurements_of(log)
-    belief, info = slam_filter.run_filter(seen.config.filter, noise, start, inputs)
-    inputs, info = jax.tree.map(np.asarray, (inputs, info))
+    """Errors of one variant, and the estimated positions (T, 2)."""
+    config = extracted.config
+    episode = restrict(extracted.episode, odometry, landmarks)
+    measurements = measurements_of(episode)
+    start = init(config.filter, jnp.zeros(3))
+    belief, info = slam_filter.run_filter(config.filter, params, start, measurements)
+    measurements, info = jax.tree.map(np.asarray, (measurements, info))
     filtered = np.asarray(info.pose, np.float64)
     scans = None
-    if odometry == "scan" and LANDMARKS[landmarks]:  # scans alone are odometry, no loop is closed
-        scans = lidar.to_scan(
-            seen.config.frontend.lidar, jnp.asarray(known.recording.ranges, float)
-        )
+    if odometry == "scan" and LANDMARKS[landmarks]:  # scan matching alone closes no loops
+        ranges = jnp.asarray(log.laser_log.ranges, float)
+        scans = jax.tree.map(np.asarray, lidar.to_scan(config.frontend.lidar, ranges))
     poses, _, _ = offline.smooth_result(
-        seen.config, noise, jnp.zeros(3), inputs, info, belief, jax.tree.map(np.asarray, scans)
+        config, params, jnp.zeros(3), measurements, info, belief, scans
     )
     numbers: common.Numbers = {"nees": None}
-    numbers["landmarks_confirmed"] = int(np.sum(confirmed(seen.config.filter, belief)))
-    numbers["ms_per_scan"] = seen.ms[odometry]
-    for prefix, way in (("", poses), ("filter_", filtered)):
-        told = log_errors.errors_against(known.recording, way, known.reference, known.relations)
-        pairs = told.get("relations", {})
-        numbers[f"{prefix}ate_rmse_m"] = told.get("ate_rmse_m")
+    numbers["landmarks_confirmed"] = int(np.sum(confirmed(config.filter, belief)))
+    numbers["ms_per_scan"] = extracted.ms[odometry]
+    for prefix, estimate in (("", poses), ("filter_", filtered)):
+        found = log_errors.errors_against(log.laser_log, estimate, log.reference, log.relations)
+        pairs = found.get("relations", {})
+        numbers[f"{prefix}ate_rmse_m"] = found.get("ate_rmse_m")
         numbers[f"{prefix}relations_translation_m"] = pairs.get("translation_mean_m")
         numbers[f"{prefix}relations_rotation_deg"] = pairs.get("rotation_mean_deg")
-    if known.reference is not None:
-        error = np.where(
-            log.truth_mask[:, None], log_errors.pose_errors(filtered, log.truth), np.nan
-        )
+    if log.reference is not None:
+        error = log_errors.pose_errors(filtered, episode.truth)
+        error = np.where(episode.truth_mask[:, None], error, np.nan)
         numbers["nees"] = log_errors.mean_nees_per_dof(error, info.pose_cov)
     return numbers, poses[:, :2]
 
 
-def compute(folder: Path | None, tune: bool, kept: common.Kept) -> common.Numbers:
-    """Rows of all logs, and the ways that are drawn.
+def compute(folder: Path | None, with_tuning: bool, cache: common.ResultCache) -> common.Numbers:
+    """Rows of all logs, and the trajectories that are drawn.
 
     Raises:
         InputError: There is no log, or one cannot be read.
     """
-    known = find(folder)
-    if not known:
+    logs = find_logs(folder)
+    if not logs:
         raise InputError("no log", advice="give --data FOLDER, or pip install '.[data]'")
-    seen = [look(one) for one in tqdm(known, unit="log", desc="looking")]
-    rows, ways = [], {}
-    for k, (one, own) in enumerate(zip(known, seen, strict=True)):
-        wheels = relative(one.recording.odom_poses[0], one.recording.odom_poses)
-        ways[one.name] = {"wheels": wheels[:, :2]}
-        if own.log.truth_mask.any():
-            ways[one.name]["reference"] = own.log.truth[own.log.truth_mask, :2]
+    extracted = [extract(log) for log in tqdm(logs, unit="log", desc="extracting features")]
+    rows, trajectories = [], {}
+    for k, (log, own) in enumerate(zip(logs, extracted, strict=True)):
+        odom_poses = log.laser_log.odom_poses
+        drawn = {"wheels": relative(odom_poses[0], odom_poses)[:, :2]}
+        trajectories[log.name] = drawn
+        if own.episode.truth_mask.any():
+            drawn["reference"] = own.episode.truth[own.episode.truth_mask, :2]
+        others = [*extracted[:k], *extracted[k + 1 :]]
         for odometry in ODOMETRY:
             noises = {"default": NoiseParams.for_laser_log(match_scans=odometry == "scan")}
-            others = [*seen[:k], *seen[k + 1 :]]
-            make = lambda others=others, odometry=odometry: {"noise": tuned(others, odometry)}
-            found = kept(f"{one.name} {odometry}", make)["noise"] if tune else None
-            if found is not None:
-                values = {name: x and jnp.asarray(x, float) for name, x in found.items()}
-                noises["tuned"] = NoiseParams(**values)
-            for landmarks in LANDMARKS:
-                for name, noise in noises.items():
-                    numbers, way = row(one, own, odometry, landmarks, noise)
-                    about = {"log": one.name, "odometry": odometry, "landmarks": landmarks}
-                    rows.append(about | {"noise": name} | numbers)
-                    print(line(rows[-1]), flush=True)
-                    if (odometry, landmarks, name) == ("scan", "all", "default"):
-                        ways[one.name]["estimate"] = way
-    ms = {one.name: own.ms for one, own in zip(known, seen, strict=True)}
-    return {"rows": rows, "ms_per_scan": ms, "ways": ways}
+            if with_tuning:
+                found = cache(f"{log.name} {odometry}", partial(tune, others, odometry))["noise"]
+                if found is not None:
+                    values = (found[name] for name in NoiseParams._fields)
+                    noises["tuned"] = NoiseParams(*values).as_arrays()
+            for landmarks, (name, params) in product(LANDMARKS, noises.items()):
+                numbers, positions = row(log, own, odometry, landmarks, params)
+                about = {"log": log.name, "odometry": odometry, "landmarks": landmarks}
+                rows.append(about | {"noise": name} | numbers)
+                print(line(rows[-1]), flush=True)
+                if (odometry, landmarks, name) == ("scan", "all", "default"):
+                    drawn["estimate"] = positions
+    ms = {log.name: own.ms for log, own in zip(logs, extracted, strict=True)}
+    return {"rows": rows, "ms_per_scan": ms, "ways": trajectories}
 
 
 def line(row: common.Numbers) -> str:
     """A row as text."""
     text = f"{row['log']:14} {row['odometry']:7} {row['landmarks']:14} {row['noise']:8}"
     names = {"ate_rmse_m": "m ATE", "relations_translation_m": "m relations"}
-    told = [
+    errors = [
         f"{row[key]:8.3f} {name} (filter {row[f'filter_{key}']:.3f})"
         for key, name in names.items()
         if row[key] is not None
     ]
-    told += [] if row["nees"] is None else [f"{row['nees']:8.3f} NEES"]
-    return f"{text}{'  '.join(told)}  {row['ms_per_scan']:.1f} ms"
+    errors += [] if row["nees"] is None else [f"{row['nees']:8.3f} NEES per dof"]
+    return f"{text}{'  '.join(errors)}  {row['ms_per_scan']:.1f} ms"
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """The way of each log, and the errors of all its rows."""
-    ways = numbers["ways"]
-    figure, axes = common.canvas(13, 4.6 * len(ways), len(ways), 2)
-    styles = {
-        "reference": {"color": common.BLACK, "linestyle": "--", "linewidth": 1.0, "zorder": 3},
-        "estimate": {"color": common.SKY, "linewidth": 2.5},
-        "wheels": {"color": common.RED, "linestyle": ":", "linewidth": 0.8},
-    }
-    for (left, right), (name, own) in zip(axes, ways.items(), strict=True):
-        for what, style in styles.items():
+    """The trajectories of each log, and the errors of all its rows."""
+    logs = numbers["ways"]
+    figure, axes = common.canvas(13, 4.6 * len(logs), len(logs), 2)
+    for (left, right), (name, own) in zip(axes, logs.items(), strict=True):
+        for what, (colour, dashes, width) in STYLES.items():
             if what in own:
-                left.plot(*np.array(own[what], float).T, label=what, **style)
+                left.plot(
+                    *np.array(own[what], float).T,
+                    dashes,
+                    color=colour,
+                    linewidth=width,
+                    zorder=3 if what == "reference" else 2,
+                    label=what,
+                )
         close = np.concatenate([np.array(own[what]) for what in own if what != "wheels"])
         low, high = close.min(axis=0) - 3.0, close.max(axis=0) + 3.0
         left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
@@ -277,27 +295,32 @@ def _draw_rows(axis: Any, rows: list[common.Numbers]) -> None:
             some = [row for row in rows if (row["odometry"], row["noise"]) == (odometry, noise)]
             if some:
                 names = [row["landmarks"] for row in some]
-                style = {"color": colour, "fillstyle": "full" if noise == "default" else "none"}
-                label = f"{odometry}, {noise} noise"
-                axis.plot(names, [row[key] for row in some], marker + "-", label=label, **style)
+                axis.plot(
+                    names,
+                    [row[key] for row in some],
+                    marker + "-",
+                    color=colour,
+                    fillstyle="full" if noise == "default" else "none",
+                    label=f"{odometry}, {noise} noise",
+                )
     axis.set(yscale="log", xlabel="landmarks")
-    axis.set_ylabel("ATE RMSE [m]" if key == "ate_rmse_m" else "mean error of relations [m]")
-    common.plain_log(axis)
+    axis.set_ylabel("ATE RMSE [m]" if key == "ate_rmse_m" else "mean relation error [m]")
+    common.log_scale(axis)
     axis.legend(fontsize="small")
 
 
-@common.ended(NAME)
+@common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
-    """Run the experiment; returns the exit code, 2 for what cannot be done, 130 for Ctrl-C."""
-    options = common.parse(__doc__, argv, data="", tune=1)
+    """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
+    args = common.parse(__doc__, argv, data="", tune=1)
     enable_caches()
-    kept = common.Kept(options.out / f"{NAME}_parts", {"data": options.data})
-    folder = Path(options.data) if options.data else None
+    cache = common.ResultCache(args.out / f"{NAME}_parts", {"data": args.data})
+    folder = Path(args.data) if args.data else None
     if folder is not None and not folder.is_dir():
         raise InputError("is no folder", path=folder, advice="name the folder of the logs")
-    numbers = compute(folder, bool(options.tune), kept)
-    common.save(options.out, NAME, {"seed": options.seed} | numbers, draw)
-    kept.clear()
+    numbers = compute(folder, bool(args.tune), cache)
+    common.save(args.out, NAME, {"seed": args.seed} | numbers, draw)
+    cache.clear()
     return 0
 
 

@@ -1,4 +1,5 @@
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -16,6 +17,13 @@ os.environ.setdefault("XLA_FLAGS", FLAGS + OLD)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(params=["float64", "float32"])
+def precision(request) -> Iterator[str]:
+    """Run a test twice: in float64, as all tests are, and in float32, as users are."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Slow versions of the front end that a reader believes at sight."""
+"""Slow versions of the front end that are obviously right."""
 
 import math
 
@@ -24,7 +24,7 @@ def block(cell, shape):
     return [(a, b) for a in rows for b in columns if a < shape[0] and b < shape[1]]
 
 
-def expand(labels, open, steps):
+def expand(labels, free, steps):
     """Breadth-first search from all sources at once; a cell that several labels reach freezes."""
     cells = np.array(labels)
     arrival = np.where(cells != 0, 0, -1)
@@ -33,7 +33,7 @@ def expand(labels, open, steps):
         reached = {}
         for cell in front:
             for beside in neighbours(cell, cells.shape):
-                if bits(cells[cell]) == 1 and open[beside] and cells[beside] == 0:
+                if bits(cells[cell]) == 1 and free[beside] and cells[beside] == 0:
                     reached.setdefault(beside, set()).add(int(cells[cell]))
         for cell, arrived in reached.items():
             cells[cell], arrival[cell] = sum(arrived), step
@@ -41,14 +41,14 @@ def expand(labels, open, steps):
     return cells, arrival
 
 
-def expand_octagons(labels, open, steps):
+def expand_octagons(labels, free, steps):
     """Steps in turn to the four and the eight neighbours, the four first, from single labels."""
     cells = np.array(labels)
     arrival = np.where(cells != 0, 0, -1)
     for step in range(1, steps + 1):
         before = cells.copy()
         single = {c: int(x) for c, x in np.ndenumerate(before) if bits(x) == 1}
-        for cell in map(tuple, np.argwhere(open & (before == 0))):
+        for cell in map(tuple, np.argwhere(free & (before == 0))):
             near = {single[c] for c in neighbours(cell, cells.shape) if c in single}
             if not near and step % 2 == 0:
                 near = {single[c] for c in block(cell, cells.shape) if c in single}
@@ -79,12 +79,12 @@ def unseparated(cells, branch, sources):
     ]
 
 
-def seen_free(ranges, first, step, spec):
+def seen_free(ranges, angle_min, angle_increment, spec):
     """Cells whose centre is nearer than the ends of the beams on either side of it."""
     free = np.zeros(spec.shape, bool)
     for i, j in np.ndindex(*spec.shape):
         x, y = (i + 0.5) * spec.cell_size + spec.x_min, (j + 0.5) * spec.cell_size - spec.y_half
-        beam = (math.atan2(y, x) - first) / step
+        beam = (math.atan2(y, x) - angle_min) / angle_increment
         if 0 <= beam < len(ranges) - 1:
             free[i, j] = math.hypot(x, y) < min(ranges[int(beam)], ranges[int(beam) + 1])
     return free

@@ -1,4 +1,4 @@
-"""Slow versions of the filter and of the matching that a reader believes at sight."""
+"""Slow versions of the filter and of data association, plain enough to check by reading."""
 
 import numpy as np
 
@@ -16,6 +16,7 @@ def wrap_line(angle):
 
 
 def compose(pose, motion):
+    """The pose (3,) after a motion (3,) in its own frame."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     x, y, turn = motion
     return np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap(pose[2] + turn)])
@@ -31,7 +32,7 @@ def motion_jacobians(pose, motion):
 
 
 def observe(state, index, kind):
-    """What the robot expects of landmark `index` of a state, and its dense Jacobian."""
+    """The predicted measurement of landmark `index` of a state, and its dense Jacobian."""
     x, y, heading = state[:3]
     at = 3 + 2 * index
     h = np.zeros((1 if kind == WALL else 2, len(state)))
@@ -46,6 +47,7 @@ def observe(state, index, kind):
 
 
 def difference(seen, expected, kind):
+    """Innovation of a measurement, angles wrapped."""
     if kind == WALL:
         return wrap_line(seen - expected)
     return np.array([seen[0] - expected[0], wrap(seen[1] - expected[1])])
@@ -64,16 +66,16 @@ class DenseSlam:
         self.mean[:3] = compose(self.mean[:3], motion)
         self.cov = f @ self.cov @ f.T + g @ q @ g.T
 
-    def update(self, sightings):
-        """Condition on (index, kind, observation, covariance) of each sighting, all at once."""
-        rows = [observe(self.mean, index, kind) for index, kind, _, _ in sightings]
+    def update(self, measurements):
+        """Update by (index, kind, measurement, covariance) of each measurement, all at once."""
+        rows = [observe(self.mean, index, kind) for index, kind, _, _ in measurements]
         v = [
             difference(seen, expected, kind)
-            for (_, kind, seen, _), (expected, _) in zip(sightings, rows, strict=True)
+            for (_, kind, seen, _), (expected, _) in zip(measurements, rows, strict=True)
         ]
         h, v = np.vstack([h for _, h in rows]), np.concatenate(v)
         r, at = np.zeros((len(v), len(v))), 0
-        for _, _, seen, noise in sightings:
+        for _, _, seen, noise in measurements:
             r[at : at + len(seen), at : at + len(seen)] = noise
             at += len(seen)
         s = h @ self.cov @ h.T + r
@@ -119,12 +121,12 @@ def match(distance, possible, gate, margin):
                 d[i, j] = distance[i, j]
     result = []
     for i in range(m):
-        believed = [
+        candidates = [
             j
             for j in range(size)
             if d[i, j] < gate
             and all(d[i, j] < d[k, j] for k in range(m) if k != i)
             and all(d[i, j] + margin < d[i, k] for k in range(size) if k != j)
         ]
-        result.append(believed[0] if believed else size)
+        result.append(candidates[0] if candidates else size)
     return np.array(result)

@@ -1,11 +1,16 @@
 """The command line: `jaxslam simulate`, `run LOG`, `map MAP.yaml` and `tune [LOG ...]`."""
 
+import inspect
+import re
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import tyro
 
 import jaxslam
-from jaxslam.cli.map_command import map_grid
+from jaxslam.cli import deprecated
+from jaxslam.cli.map_command import map_occupancy
 from jaxslam.cli.run_command import run
 from jaxslam.cli.simulate_command import simulate
 from jaxslam.cli.tune_command import tune
@@ -14,16 +19,35 @@ from jaxslam.io.errors import InputError
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 `jaxslam COMMAND --help` lists the options of a command, `jaxslam --version` prints the version."""
 
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "simulate": simulate,
+    "run": run,
+    "map": map_occupancy,
+    "tune": tune,
+}
+
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code: 2 for bad input, 130 for Ctrl-C."""
+    """Run the command line and return its exit code: 2 for bad input, 130 for Ctrl-C.
+
+    Args:
+        argv: Arguments; by default those of the process, and `--help` if there are none.
+
+    Raises:
+        SystemExit: Of code 0 after `--help`, of code 2 after wrong usage.
+    """
     argv = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if argv[0] == "--version":
         print(f"jaxslam {jaxslam.__version__}")
         return 0
-    commands = {"simulate": simulate, "run": run, "map": map_grid, "tune": tune}
+    command, *options = deprecated.rewrite(argv)
     try:
-        tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
+        if command in COMMANDS:
+            function = COMMANDS[command]
+            function.__doc__ = _unwrapped(function.__doc__ or "")
+            tyro.cli(function, prog=f"jaxslam {command}", args=options)
+        else:
+            _usage(argv)
     except InputError as error:
         print(f"jaxslam: error: {error}", file=sys.stderr)
         return 2
@@ -31,3 +55,23 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxslam: {str(interrupt) or 'interrupted, nothing written'}", file=sys.stderr)
         return 130
     return 0
+
+
+def _usage(argv: list[str]) -> None:
+    """Exit by `--help`, or by what is wrong: the arguments begin with no command."""
+
+    def summary(function: Callable[..., Any]) -> Callable[[], None]:
+        def stub() -> None: ...
+
+        stub.__doc__ = (function.__doc__ or "").splitlines()[0]
+        return stub
+
+    commands: dict[str, Callable[..., Any]] = {
+        name: summary(function) for name, function in COMMANDS.items()
+    }
+    tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
+
+
+def _unwrapped(docstring: str) -> str:
+    """A docstring with each argument on one line: tyro keeps line breaks of their descriptions."""
+    return re.sub(r"\n {8}(?=\S)", " ", inspect.cleandoc(docstring))

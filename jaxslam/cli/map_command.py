@@ -8,7 +8,7 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.options import check_range, name_errors
+from jaxslam.cli.options import OutFolder, check_range, name_errors
 from jaxslam.evaluation import map_metrics
 from jaxslam.io import graphml, ros_map
 from jaxslam.io.output import folder, write_json
@@ -17,30 +17,30 @@ from jaxslam.mapping import grid_topology
 MIN_REGION_AREA = 1.0  # [m^2] of the smallest region that `map --regions all` keeps
 
 
-def map_grid(
-    map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP.yaml")],
-    clearance: float = 0.25,
-    speck: float = 0.1,
+def map_occupancy(
+    map_file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP.yaml")],
+    robot_radius: float = 0.25,
+    min_obstacle_size: float = 0.1,
     regions: Literal["largest", "all"] = "largest",
-    out: Path = Path("out"),
+    out: OutFolder = Path("out"),
 ) -> None:
     """Extract the topological map of a ROS occupancy grid.
 
     Writes metrics.json, map.geojson, map.graphml and map.png; needs the extras [ros] and [graph].
 
     Args:
-        map: YAML file of map_server, with its image in the same folder.
-        clearance: Robot radius [m]: least distance of the map to obstacles.
-        speck: Minimum obstacle size [m]: smaller ones in free space are noise.
+        map_file: YAML file of map_server, with its image in the same folder.
+        robot_radius: Robot radius [m]: least distance of nodes and arcs to obstacles.
+        min_obstacle_size: Minimum obstacle size [m]: smaller ones in free space are noise.
         regions: Connected regions of the robot's centre: the largest, or all of at least 1 m^2.
         out: Folder for the results.
     """
-    check_range("--clearance", clearance, 0.01, 100.0)
-    check_range("--speck", speck, 0.0, 100.0)
+    check_range("--robot-radius", robot_radius, 0.01, 100.0)
+    check_range("--min-obstacle-size", min_obstacle_size, 0.0, 100.0)
     graphml.require()
-    grid = ros_map.read(map)
+    grid = ros_map.read(map_file)
     rows, columns = grid.free.shape
-    print(f"{map}: {rows} x {columns} cells of {grid.resolution:g} m", flush=True)
+    print(f"{map_file}: {rows} x {columns} cells of {grid.resolution:g} m", flush=True)
     stages = (*grid_topology.STAGES, "writing")
     with (
         folder(out) as out_dir,
@@ -52,24 +52,25 @@ def map_grid(
             bar.update(stages.index(stage) - bar.n)
 
         start = perf_counter()
-        with name_errors(str(map)):
+        with name_errors(str(map_file)):
             result = grid_topology.extract_topology(
                 grid.occupied,
                 grid.free,
                 resolution=grid.resolution,
                 origin=grid.origin,
-                robot_radius=clearance,
-                min_obstacle_size=speck,
+                robot_radius=robot_radius,
+                min_obstacle_size=min_obstacle_size,
                 min_region_area=MIN_REGION_AREA if regions == "all" else None,
                 callback=show_progress,
             )
         seconds = {"run": perf_counter() - start}
         show_progress("writing")
-        numbers = map_metrics.map_metrics(result) | {"clearance_m": clearance, "seconds": seconds}
+        numbers = map_metrics.map_metrics(result)
+        numbers |= {"clearance_m": robot_radius, "seconds": seconds}
         write_json(out_dir / "metrics.json", numbers)
         report.write_map(out_dir / "map.geojson", result.graph)
         graphml.write(out_dir / "map.graphml", result.graph)
         report.draw_map(out_dir / "map.png", grid, result.graph)
         bar.update()
-    title = f"{map}: robot radius {clearance:g} m, regions {result.num_regions}"
+    title = f"{map_file}: robot radius {robot_radius:g} m, regions {result.num_regions}"
     summaries.print_map_summary(numbers, title, out)

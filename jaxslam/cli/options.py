@@ -1,24 +1,33 @@
-"""Shared by the commands: checks of options, compilation cache, timing."""
+"""Shared by the commands: types and checks of options, timing."""
 
-import gc
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated
 
 import jax
 import numpy as np
+import tyro
 
-from jaxslam.core import trace_cache
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import noise_file
 from jaxslam.io.errors import InputError
 
-GC_THRESHOLD = (
-    100_000  # threshold of the garbage collector: net new objects between two collections
-)
+OptionalFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+"""Option that names a file, or none."""
+
+OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
+"""Option that is a whole number, or not given."""
+
+OptionalTopic = Annotated[str | None, tyro.conf.arg(metavar="TOPIC", help_behavior_hint="")]
+"""Option that names a topic of a bag, or none."""
+
+Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+"""Option that names several files, or none."""
+
+OutFolder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+"""Option that names the folder of the results."""
 
 
 def check_range(option: str, value: float, low: float, high: float) -> None:
@@ -41,38 +50,16 @@ def read_params(path: Path | None, default: NoiseParams) -> NoiseParams:
     return default if path is None else noise_file.read(path, default)
 
 
-def enable_caches() -> None:
-    """Enable the persistent caches of traced and compiled programs in the user's cache folder.
-
-    A cache folder that JAX is already configured with is kept. Garbage is collected less often from
-    here on: otherwise garbage collection takes a quarter of the time in which JAX traces.
-    """
-    gc.freeze()
-    gc.set_threshold(GC_THRESHOLD)
-    trace_cache.enable()
-    if jax.config.jax_compilation_cache_dir is not None:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    cache = Path(home) / "jaxslam"
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if os.access(cache, os.W_OK | os.X_OK):
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-
-
 @contextmanager
 def stopwatch() -> Iterator[dict[str, float]]:
     """Measure the block: seconds in XLA's compiler (`compile`) and the rest (`run`)."""
     seconds = {"compile": 0.0, "run": 0.0}
-    spans = []
+    spans: list[tuple[float, float]] = []
 
-    def listen(event: str, duration: float, **_: Any) -> None:
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
         if running and event == "/jax/core/compile/backend_compile_duration":
             now = perf_counter()
-            spans.append((now - duration, now))
+            spans.append((now - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     start, running = perf_counter(), True

@@ -24,6 +24,7 @@ from jaxslam.simulation.worlds import World
 from jaxslam.tuning.fitting import TuneResult
 from jaxslam.tuning.parameters import param_names
 
+# Names in map.geojson of the kinds of landmark: junction, corner, wall direction.
 KINDS = ("node", "corner", "wall")
 MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
 
@@ -46,19 +47,23 @@ def write_maps(
     """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml."""
     grid = occupancy_map(config.frontend.lidar, result.poses, scans, resolution=MAP_RESOLUTION)
     ros_map.write(out_dir / "map.yaml", grid)
-    g2o_writer.write(
-        out_dir / "graph.g2o", pose_graph.build_pose_graph(config, params, result, measurements)
+    graph = pose_graph.build_pose_graph(
+        config.filter,
+        params,
+        result.poses,
+        result.belief,
+        result.info,
+        measurements,
+        result.loop_closures,
     )
+    g2o_writer.write(out_dir / "graph.g2o", graph)
     if find_spec("networkx") is not None:
         graphml.write(out_dir / "map.graphml", result.topological_map)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
     """Draw the local Voronoi diagram of scan `number` of [T]."""
-    from jaxslam.viz import (
-        canvas,
-        maps,  # imported here, because matplotlib is slow to import
-    )
+    from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
 
     scan = jax.tree.map(lambda leaf: leaf[number], scans)
     features, diagram, sources = jax.jit(extract.extract_diagram, static_argnums=0)(
@@ -113,11 +118,8 @@ def draw(
         world: World whose walls are drawn.
         scans: Scans [T] whose end points are drawn.
     """
-    from jaxslam.viz import (
-        canvas,
-        charts,  # imported here, because matplotlib is slow to import
-        maps,
-    )
+    # Imported here, because matplotlib is slow to import.
+    from jaxslam.viz import canvas, charts, maps
 
     poses = result.poses
     walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
@@ -129,7 +131,7 @@ def draw(
     if world is not None:
         maps.draw_walls(axis, world)
     if scans is not None:
-        points = jax.vmap(lidar.beam_ends, in_axes=(0, None))(scans, config.frontend.lidar)
+        points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
         maps.draw_hits(axis, poses, np.asarray(points), np.asarray(scans.hit))
     for what, line in (lines | {"estimate": poses}).items():
         maps.draw_trajectory(axis, line, what)
@@ -146,10 +148,7 @@ def draw(
 
 def draw_map(path: Path, occupancy: OccupancyMap, graph: TopologicalMap) -> None:
     """Draw an occupancy grid with its topological map."""
-    from jaxslam.viz import (
-        canvas,
-        maps,  # imported here, because matplotlib is slow to import
-    )
+    from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
 
     figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
     maps.draw_occupancy(axis, occupancy)
@@ -160,10 +159,7 @@ def draw_map(path: Path, occupancy: OccupancyMap, graph: TopologicalMap) -> None
 
 def draw_history(path: Path, found: TuneResult) -> None:
     """Draw losses and parameters over the evaluations of a tuning."""
-    from jaxslam.viz import (
-        canvas,
-        charts,  # imported here, because matplotlib is slow to import
-    )
+    from jaxslam.viz import canvas, charts  # imported here, because matplotlib is slow to import
 
     figure, axes = canvas.canvas(11.0, 4.0, 1, 2)
     charts.draw_losses(axes[0, 0], found.loss, found.heldout, found.best)

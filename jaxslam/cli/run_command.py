@@ -9,38 +9,54 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.options import check_range, enable_caches, name_errors, read_params, stopwatch
+from jaxslam.cli.options import (
+    OptionalCount,
+    OptionalFile,
+    OptionalTopic,
+    OutFolder,
+    check_range,
+    name_errors,
+    read_params,
+    stopwatch,
+)
+from jaxslam.core.caches import enable_caches
+from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
+from jaxslam.core.se2_np import increments as increments_of
 from jaxslam.core.se2_np import relative
 from jaxslam.evaluation import log_errors
+from jaxslam.evaluation.log_errors import Trajectory
+from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
 from jaxslam.io import readers, tum
+from jaxslam.io import relations as relations_file
 from jaxslam.io.output import folder
-from jaxslam.io.relations import read
-from jaxslam.pipeline import episodes, offline
-from jaxslam.pipeline.config import MAX_LANDMARKS, Config
+from jaxslam.pipeline import arguments, offline
+from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import SlamResult
 from jaxslam.pipeline.online import ChunkResult, SlamState
-from jaxslam.viz import animation
 from jaxslam.viz.rerun_view import RerunView
 
 
 def run(
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")],
-    reference: Path | None = None,
-    relations: Path | None = None,
+    reference: OptionalFile = None,
+    relations: OptionalFile = None,
     odometry: Literal["scan", "wheels"] = "scan",
     smooth: bool = True,
-    noise: Path | None = None,
-    scan_topic: str | None = None,
-    odometry_topic: str | None = None,
-    scan: int | None = None,
-    animate: bool = False,
-    view: Literal["live", "file"] | None = None,
-    out: Path = Path("out"),
+    noise: OptionalFile = None,
+    scan_topic: OptionalTopic = None,
+    odometry_topic: OptionalTopic = None,
+    scan: OptionalCount = None,
+    gif: bool = False,
+    rerun: Annotated[
+        Literal["live", "file"] | None,
+        tyro.conf.arg(metavar="{live,file}", help_behavior_hint=""),
+    ] = None,
+    out: OutFolder = Path("out"),
 ) -> None:
     """Run SLAM on a laser log.
 
@@ -62,122 +78,144 @@ def run(
         odometry_topic: Topic of the odometry or of the transforms in a bag; by default the one
             with most messages.
         scan: Number of a scan, from 0, whose local Voronoi diagram is drawn: scan.png.
-        animate: Write an animation of the run: run.gif.
-        view: Show the run in the rerun viewer while it is processed (live), or write run.rrd for it
-            (file); needs the extra [view].
+        gif: Write an animation of the run: run.gif.
+        rerun: Show the run in the rerun viewer while it is processed (live), or write run.rrd for
+            it (file); needs the extra [view].
         out: Folder for the results.
     """
-    laser_log = readers.read(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
-    times = laser_log.times
+    laser_log = readers.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
     known = None if reference is None else tum.read(reference)
-    verified = None if relations is None else read(relations)
-    scan_matching = odometry == "scan"
-    noise_params = read_params(noise, NoiseParams.for_laser_log(match_scans=scan_matching))
+    verified = None if relations is None else relations_file.read(relations)
+    match_scans = odometry == "scan"
+    params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     if scan is not None:
-        check_range("--scan", scan, 0, len(times) - 1)
-    config = episodes.laser_log_config([laser_log])._replace(
-        filter=episodes.laser_log_config([laser_log]).filter._replace(
-            max_landmarks=MAX_LANDMARKS,
-        ),
-    )
+        check_range("--scan", scan, 0, len(laser_log.times) - 1)
     odom_poses = relative(laser_log.odom_poses[0], laser_log.odom_poses)
-    with name_errors(f"{reference or ''}"):
+    with name_errors(str(log)):
+        config = Config.for_laser_log(laser_log.lidar)
+        config.check()
+        increments = arguments.as_log_odometry(increments_of(odom_poses))
+        scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
+        arguments.as_scans(config.frontend.lidar, scans, len(increments))
+    with name_errors(str(reference)):
         dead_reckoning = log_errors.errors_against(laser_log, odom_poses, known, None)
-    with name_errors(f"{relations or ''}"):
+    with name_errors(str(relations)):
         dead_reckoning |= log_errors.errors_against(laser_log, odom_poses, None, verified)
-    increments = episodes.odometry_increments(odom_poses)
-    scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
     with folder(out) as out_dir:
         enable_caches()
-        size = f"{len(times)} scans of {config.frontend.lidar.num_beams} beams"
+        size = f"{len(increments)} scans of {config.frontend.lidar.num_beams} beams"
         print(f"{log}: {size}{laser_log.source}", flush=True)
         with stopwatch() as seconds:
             viewer = None
-            if view is not None:
-                file = out_dir / "run.rrd" if view == "file" else None
-                viewer = RerunView(config, times, scans, file)
+            if rerun is not None:
+                file = out_dir / "run.rrd" if rerun == "file" else None
+                viewer = RerunView(config, laser_log.times, scans, file)
             result = _run_slam(
                 config,
-                noise_params,
+                params,
                 increments,
                 scans,
-                aligned=scan_matching,
+                match_scans=match_scans,
                 smooth=smooth,
                 viewer=viewer,
             )
-            poses = result.poses
         numbers = {
-            "scans": len(poses),
+            "scans": len(result.poses),
             "skipped_lines": laser_log.num_skipped,
             "mended": laser_log.odometry_repairs,
             "odometry": odometry,
-            "path_length_m": log_errors.path_length(poses if scan_matching else odom_poses),
+            "path_length_m": log_errors.path_length(result.poses if match_scans else odom_poses),
             "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
             "matches": float(np.mean(np.sum(np.asarray(result.info.used), axis=1))),
             "closures": len(result.loop_closures.first) if result.loop_closures else 0,
             "seconds": seconds,
         }
-        trajectories, error = {"odometry": odom_poses}, None
-        online_poses = np.asarray(result.info.pose, np.float64)
-        if known is not None:
-            trajectories["reference"] = log_errors.reference_in_map(times, poses, known)
-            error = log_errors.errors_since_start(times, online_poses, known)
-            numbers["nees"] = log_errors.mean_nees_per_dof(error, np.asarray(result.info.pose_cov))
+        numbers |= _errors(laser_log, result, known, verified, smooth=smooth)
         if dead_reckoning:
-            numbers |= log_errors.errors_against(laser_log, poses, known, verified)
-            if smooth:
-                numbers["filter"] = log_errors.errors_against(
-                    laser_log, online_poses, known, verified
-                )
             numbers["dead_reckoning"] = dead_reckoning
-        report.write_results(out_dir, numbers, times, result)
-        inputs = Measurement(
+        report.write_results(out_dir, numbers, laser_log.times, result)
+        measurements = Measurement(
             jnp.asarray(increments, float), result.features, scan_match=result.scan_matches
         )
-        config = config._replace(
-            filter=config.filter._replace(
-                max_landmarks=result.belief.num_seen.size,
-            ),
+        config = config._replace(  # the map has grown to its size, which the files are made for
+            filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)
         )
-        report.write_maps(out_dir, config, noise_params, result, inputs, scans)
+        report.write_maps(out_dir, config, params, result, measurements, scans)
+        trajectories, error = {"odometry": odom_poses}, None
+        if known is not None:
+            trajectories["reference"] = log_errors.reference_in_map(
+                laser_log.times, result.poses, known
+            )
+            error = _online_errors(laser_log, result, known)
         report.draw(out_dir, config, result, trajectories, error, scans=scans)
         if scan is not None:
             report.draw_scan(out_dir / "scan.png", config, scans, scan)
-        if animate:
-            gif = out_dir / "run.gif"
-            animation.animate_run(gif, config, noise_params, inputs, scans, poses, odom_poses)
-    summaries.print_summary(numbers, f"{len(poses)} scans of {log}", out)
+        if gif:
+            from jaxslam.viz import animation  # imported here, because matplotlib is slow to import
+
+            animation.animate_run(
+                out_dir / "run.gif", config, params, measurements, scans, result.poses, odom_poses
+            )
+    summaries.print_summary(numbers, f"{len(result.poses)} scans of {log}", out)
+
+
+def _errors(
+    laser_log: LaserLog,
+    result: SlamResult,
+    reference: Trajectory | None,
+    relations: Relations | None,
+    *,
+    smooth: bool,
+) -> Metrics:
+    """Errors of the trajectory, and of the filter if it was smoothed; none without a reference."""
+    numbers: Metrics = {}
+    if reference is not None:
+        error, cov = _online_errors(laser_log, result, reference), np.asarray(result.info.pose_cov)
+        numbers["nees"] = log_errors.mean_nees_per_dof(error, cov)
+    if reference is not None or relations is not None:
+        numbers |= log_errors.errors_against(laser_log, result.poses, reference, relations)
+        if smooth:
+            online_poses = np.asarray(result.info.pose, np.float64)
+            numbers["filter"] = log_errors.errors_against(
+                laser_log, online_poses, reference, relations
+            )
+    return numbers
+
+
+def _online_errors(laser_log: LaserLog, result: SlamResult, reference: Trajectory) -> np.ndarray:
+    """Errors (T, 3) [m, m, rad] of the online estimates since the first scan."""
+    online_poses = np.asarray(result.info.pose, np.float64)
+    return log_errors.errors_since_start(laser_log.times, online_poses, reference)
 
 
 def _run_slam(
     config: Config,
-    noise: NoiseParams,
+    params: NoiseParams,
     increments: np.ndarray,
     scans: Scan,
     *,
-    aligned: bool,
+    match_scans: bool,
     smooth: bool,
     viewer: RerunView | None,
 ) -> SlamResult:
     """Run SLAM on a log, with a progress bar."""
     with tqdm(total=len(increments), unit="scan", desc="compiling", mininterval=0.2) as bar:
 
-        def show_progress(mapper: SlamState, part: ChunkResult) -> None:
-            done = bar.n + len(part.info.finite) == len(increments)
+        def show_progress(state: SlamState, chunk: ChunkResult) -> None:
+            done = bar.n + len(chunk.info.finite) == len(increments)
             bar.set_description("smoothing" if done and smooth else "mapping", refresh=False)
-            num_landmarks = int(np.sum(confirmed(config.filter, mapper.belief)))
+            num_landmarks = int(np.sum(confirmed(config.filter, state.belief)))
             bar.set_postfix_str(f"{num_landmarks} landmarks", refresh=False)
-            bar.update(len(part.info.finite))
+            bar.update(len(chunk.info.finite))
             if viewer is not None:
-                viewer.watch(mapper, part)
+                viewer.watch(state, chunk)
 
         result = offline.run_slam(
             config,
-            noise,
-            jnp.zeros(3),
+            params,
             increments,
             scans,
-            match_scans=aligned,
+            match_scans=match_scans,
             smooth=smooth,
             callback=show_progress,
         )

@@ -10,7 +10,15 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.options import check_range, enable_caches, name_errors, read_params, stopwatch
+from jaxslam.cli.options import (
+    OptionalFile,
+    OutFolder,
+    check_range,
+    name_errors,
+    read_params,
+    stopwatch,
+)
+from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation import log_errors, summary
@@ -21,19 +29,20 @@ from jaxslam.io.output import folder
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.simulation import drives, path_following, trials, worlds
+from jaxslam.simulation import drives, path_following, worlds
+from jaxslam.simulation import trials as trials_module
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
 
 def simulate(
     world: str = "office",
-    runs: int = 100,
+    trials: int = 100,
     seed: int = 0,
-    noise: Path | None = None,
-    landmarks: Literal["all", "nodes"] = "all",
-    labels: Literal["runs", "codes"] = "runs",
-    out: Path = Path("out"),
+    noise: OptionalFile = None,
+    landmarks: Literal["all", "junctions"] = "all",
+    labels: Literal["segments", "codes"] = "segments",
+    out: OutFolder = Path("out"),
 ) -> None:
     """Run SLAM on Monte-Carlo trials: simulated drives of one robot from S to F.
 
@@ -42,82 +51,79 @@ def simulate(
 
     Args:
         world: World with a path from S to F: office.
-        runs: Number of trials.
+        trials: Number of trials.
         seed: Random seed of the odometry and range noise.
         noise: File of the noise parameters of the filter (Q and R); by default those of the
             simulated robot.
-        landmarks: Landmark types: all, or only the junctions (the paper's nodes).
-        labels: Labels of occupied cells in the Voronoi expansion: straight wall segments (runs),
-            or the paper's edge codes (codes).
+        landmarks: Landmark types: all, or only the junctions of the Voronoi diagram (the paper's
+            nodes).
+        labels: Labels of occupied cells in the Voronoi expansion: straight wall segments, or the
+            paper's edge codes. `--landmarks junctions --labels codes` is the paper's method.
         out: Folder for the results.
     """
     use_cpu_devices()
-    check_range("--runs", runs, 1, 10**6)
+    check_range("--trials", trials, 1, 10**6)
     check_range("--seed", seed, 0, 2**32 - 1)
     with name_errors("--world"):
         walls = World(jnp.asarray(worlds.named(world).walls, float))
         path = jnp.asarray(path_following.densify(worlds.waypoints(world)), float)
-    config = Config(
-        frontend=FrontendConfig(
-            labels=labels,
-        ),
-    )
-    config = (
-        config._replace(
-            filter=config.filter._replace(
-                landmark_kinds=(JUNCTION,),
-            ),
-        )
-        if landmarks == "nodes"
-        else config
-    )
+    config = Config(frontend=FrontendConfig(labels=labels))
+    if landmarks == "junctions":
+        config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     robot = Robot()
-    noise_params = read_params(noise, NoiseParams.for_simulated_robot(*robot))
+    params = read_params(noise, NoiseParams.for_simulated_robot(*robot))
     key = jax.random.key(seed)
     with folder(out) as out_dir:
         enable_caches()
-        steps = drives.num_scans_of_drive(robot, path)
+        num_scans = drives.num_scans_of_drive(robot, path)
         with stopwatch() as seconds:
-            groups = trials.run_trials(
-                key, config, robot, noise_params, walls, path, num_trials=runs, num_scans=steps
+            groups = trials_module.run_trials(
+                key,
+                config,
+                params,
+                robot,
+                walls,
+                path,
+                num_trials=trials,
+                num_scans=num_scans,
             )
-            tracks = _collect(groups, runs)
-        numbers = summary.evaluate(tracks) | {
-            "ate_rmse_m": log_errors.mean_ate(tracks),
-            "path_length_m": float(
-                np.mean([log_errors.path_length(poses) for poses in tracks.truth])
-            ),
+            results = _collect(groups, trials)
+        lengths = [log_errors.path_length(poses) for poses in np.asarray(results.truth)]
+        numbers = summary.evaluate(results) | {
+            "ate_rmse_m": log_errors.mean_ate(results),
+            "path_length_m": float(np.mean(lengths)),
             "seconds": seconds,
         }
-        truth, result = trials.replay_trial(
-            key, config, robot, noise_params, walls, path, trial=0, num_scans=steps
+        true_poses, result = trials_module.replay_trial(
+            key, config, params, robot, walls, path, trial=0, num_scans=num_scans
         )
-        truth, stamps = np.asarray(truth, np.float64), np.arange(steps, dtype=float)
+        truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, stamps, result)
         tum.write(out_dir / "truth.tum", stamps, truth)
-        trajectories = {"odometry": tracks.dead_reckoning[0], "truth": truth}
+        trajectories = {"odometry": np.asarray(results.dead_reckoning[0]), "truth": truth}
         error = log_errors.pose_errors(result.poses, truth)
         report.draw(out_dir, config, result, trajectories, error, world=walls)
-    summaries.print_summary(numbers, f"{runs} trials of {steps} scans, world {world}", out)
+    summaries.print_summary(numbers, f"{trials} trials of {num_scans} scans, world {world}", out)
 
 
-def _collect(groups: Iterable[TrialResult], runs: int) -> TrialResult:
+def _collect(groups: Iterable[TrialResult], num_trials: int) -> TrialResult:
     """All trials of an experiment, with a progress bar; print the errors of the first group."""
     done: list[TrialResult] = []
     errors: list[np.ndarray] = []
-    with tqdm(total=runs, unit="trial", desc="compiling", mininterval=0.5) as bar:
+    with tqdm(total=num_trials, unit="trial", desc="compiling", mininterval=0.5) as bar:
         for group in groups:
+            truth = np.asarray(group.truth)
             done.append(group)
-            errors.append(log_errors.pose_errors(group.estimate, group.truth))
+            errors.append(log_errors.pose_errors(np.asarray(group.estimate), truth))
             rmse = summary.rmse_of(np.concatenate(errors))["position_rmse_m"]
             if len(done) == 1:
-                odom_error = log_errors.pose_errors(group.dead_reckoning, group.truth)
+                odom_error = log_errors.pose_errors(np.asarray(group.dead_reckoning), truth)
                 odom_rmse = summary.rmse_of(odom_error)["position_rmse_m"]
                 bar.write(
-                    f"first {len(group.truth)} trials: position RMSE {rmse:.3f} m, "
+                    f"first {len(truth)} trials: position RMSE {rmse:.3f} m, "
                     f"by dead reckoning {odom_rmse:.3f} m"
                 )
                 bar.set_description("running")
             bar.set_postfix_str(f"position RMSE {rmse:.3f} m", refresh=False)
-            bar.update(len(group.truth))
+            bar.update(len(truth))
     return episodes.concatenate_results(done)

@@ -3,13 +3,12 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-import jax
 import numpy as np
 
-from jaxslam.evaluation.log_errors import Metrics
-from jaxslam.filtering.noise import NoiseParams
-from jaxslam.tuning.parameters import param_names
+from jaxslam.evaluation.summary import Metrics
+from jaxslam.io import noise_file
 
 SUMMARY_ROWS = (
     ("position_rmse_m", "position RMSE", "m"),
@@ -46,7 +45,7 @@ def print_summary(numbers: Metrics, title: str, out: Path) -> None:
 
 
 def _print_errors(slam_errors: Metrics, odometry_errors: Metrics) -> None:
-    """Print the `SUMMARY_ROWS` that there are: error of SLAM, of dead reckoning, and their ratio."""
+    """Print the `SUMMARY_ROWS` that there are: errors of SLAM, of dead reckoning, their ratio."""
     for key, name, unit in SUMMARY_ROWS:
         error = slam_errors.get(key)
         if error is None:
@@ -83,28 +82,36 @@ def print_tuning_summary(numbers: Metrics, title: str, out: Path) -> None:
     print(f"\n{title}; {numbers['evaluations']} evaluations, evaluated on {numbers['judged_on']}")
     print(f"  {'':34}{'before':>12}{'after':>12}")
     rows = {"loss": "loss", "position_rmse_m": "position RMSE [m]", "nees": "NEES per dof"}
-    rows |= {"heading_rmse_deg": "heading RMSE [deg]", "diverged": "diverged runs"}
+    rows |= {"heading_rmse_deg": "heading RMSE [deg]", "diverged": "diverged episodes"}
     for key, name in rows.items():
         if numbers.get(key) is not None and before.get(key) is not None:
             print(f"  {name:34}{before[key]:12.4g}{numbers[key]:12.4g}")
-    _print_noise(before["noise"], numbers["noise"], numbers["standard_errors"] or {})
+    _print_params(before["noise"], numbers["noise"], numbers["standard_errors"] or {})
     for warning in numbers["warnings"]:
         print(f"warning: {warning}")
     _print_seconds(numbers)
     print(f"results: {out}{os.sep}noise.json, metrics.json, history.png")
 
 
-def _print_noise(
-    before: NoiseParams, after: NoiseParams, standard_errors: Mapping[str, float]
+def _print_params(
+    before: Mapping[str, Any], after: Mapping[str, Any], standard_errors: Mapping[str, float]
 ) -> None:
-    """Print the noise parameters before and after a tuning, with relative standard errors."""
+    """Print the noise parameters before and after a tuning, with relative standard errors.
+
+    Args:
+        before: Numbers or arrays by their keys in `metrics.json`; None where there is none.
+        after: Likewise.
+        standard_errors: By key; of an array, with an index.
+    """
     if standard_errors:
         print(f"  {'noise parameters (Q and R)':34}{'':24}{'standard error':>18}")
-    old, new = (
-        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(noise)])
-        for noise in (before, after)
-    )
-    for name, old_value, new_value in zip(param_names(after), old, new, strict=True):
-        error = standard_errors.get(name, np.nan)
-        text = "" if np.isnan(error) else "unknown" if np.isinf(error) else f"{error:.0%}"
-        print(f"  {name:34}{old_value:12.4g}{new_value:12.4g}{text:>18}".rstrip())
+    for key, value in after.items():
+        if value is None:
+            continue
+        pairs = zip(np.ravel(before[key]), np.ravel(value), strict=True)
+        for index, (old, new) in enumerate(pairs):
+            number = f"{key}[{index}]" if np.ndim(value) else key
+            error = standard_errors.get(number, np.nan)
+            text = "" if np.isnan(error) else "unknown" if np.isinf(error) else f"{error:.0%}"
+            name = noise_file.name_of(number)
+            print(f"  {name:34}{old:12.4g}{new:12.4g}{text:>18}".rstrip())

@@ -12,21 +12,29 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.options import check_range, enable_caches, name_errors, stopwatch
-from jaxslam.cli.tune_jobs import TuneJob, recorded_job, simulated_job
+from jaxslam.cli.options import (
+    Files,
+    OptionalCount,
+    OptionalFile,
+    OutFolder,
+    check_range,
+    name_errors,
+    stopwatch,
+)
+from jaxslam.cli.tune_jobs import TuneJob, recorded_task, simulated_task
+from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.episode import Episode
 from jaxslam.evaluation import summary
-from jaxslam.evaluation.log_errors import Metrics
+from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import checkpoint, noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.pipeline import episodes
-from jaxslam.tuning import fitting, losses, optimizers, parameters
-from jaxslam.tuning import standard_errors as standard_errors_module
-from jaxslam.tuning.fitting import TuneResult, TuneState
+from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors, tune_state
 from jaxslam.tuning.losses import Loss
+from jaxslam.tuning.tune_state import TuneResult, TuneState
 
 PARAMS_FILE, CHECKPOINT_FILE = "noise.json", "tune.npz"
 
@@ -36,89 +44,98 @@ class _Settings(NamedTuple):
 
     loss: Loss
     frozen: tuple[str, ...]
-    steps: int
-    batch: int | None
+    num_updates: int
+    batch_size: int | None
     seed: int
     patience: int | None
 
 
 def tune(
     logs: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[LOG ...]")
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="[LOG ...]", help_behavior_hint=""),
     ] = (),
-    test: tuple[Path, ...] = (),
-    reference: tuple[Path, ...] = (),
+    test: Files = (),
+    reference: Files = (),
     odometry: Literal["scan", "wheels"] = "scan",
     world: str = "office",
-    runs: int = 32,
+    trials: int = 32,
     heldout: int = 16,
-    loss: Literal["calibrated", "localisation", "likelihood"] = "calibrated",
-    steps: int = 30,
-    batch: int | None = None,
-    patience: int | None = None,
-    freeze: tuple[str, ...] = (),
-    noise: Path | None = None,
+    loss: Literal["pose_nll", "pose_mse", "innovation_nll"] = "pose_nll",
+    updates: int = 30,
+    batch: OptionalCount = None,
+    patience: OptionalCount = None,
+    freeze: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
+    ] = (),
+    noise: OptionalFile = None,
     seed: int = 0,
-    out: Path = Path("out"),
+    out: OutFolder = Path("out"),
 ) -> None:
-    """Tune the noise parameters of the filter (Q and R) on logs or on simulated runs.
+    """Tune the noise parameters of the filter (Q and R) on logs or on simulated trials.
 
     Writes noise.json, which --noise of the other commands reads; metrics.json with the errors
     before and after, and the standard errors of the parameters; and history.png. When interrupted,
     noise.json holds the best parameters so far, and the same command resumes the tuning.
 
-    The parameters are the four coefficients of the odometry noise, range, bearing, scale and wall
-    of the measurement noise, and the factor on the uncertainty of scan matching (alignment). They
-    are optimised by gradient. Parameters of data association, such as the gate, are not
-    differentiable and are not tuned.
+    The parameters are the four coefficients of the odometry noise (Q); standard deviations of range
+    and bearing, of a wall's direction, and a factor on the front end's own (R); and a factor on
+    those of scan matching. They are optimised by gradient. Parameters of data association, such as
+    the gate, are not differentiable and are not tuned.
 
     Args:
         logs: Laser logs, as `jaxslam run` reads them, or folders of MRCLAM data sets (FOLDER for
-            all of its robots, FOLDER/Robot2 for one); none: simulated runs.
+            all of its robots, FOLDER/Robot2 for one); none: simulated trials.
         test: Held-out logs, for evaluation only.
         reference: Reference trajectory, a TUM file, of each laser log: first of the logs to tune
             on, then of --test; MRCLAM data sets contain theirs.
         odometry: For laser logs: scan matching fused with wheel odometry (scan), or wheel odometry
             alone (wheels).
-        world: World of the simulated runs.
-        runs: Number of simulated runs to tune on.
-        heldout: Number of simulated held-out runs, for evaluation only.
-        loss: Loss to minimise. calibrated: negative log density of the true pose, which needs both
-            accuracy and a consistent covariance; localisation: pose error alone, which leaves the
-            scale of the noise undetermined; likelihood: negative log-likelihood of the innovations,
-            the only one that needs no reference.
-        steps: Updates of the optimiser: L-BFGS, or Adam with --batch.
-        batch: Runs per update (minibatch); by default all.
+        world: World of the simulated trials.
+        trials: Number of simulated trials to tune on.
+        heldout: Number of simulated held-out trials, for evaluation only.
+        loss: Loss to minimise. pose_nll: negative log density of the true pose, which needs both
+            accuracy and a consistent covariance; pose_mse: squared pose error alone, which leaves
+            the scale of the noise undetermined; innovation_nll: negative log-likelihood of the
+            innovations, the only one that needs no reference.
+        updates: Updates of the optimiser: L-BFGS, or Adam with --batch.
+        batch: Episodes (logs or trials) per update (minibatch); by default all.
         patience: Stop after this many evaluations without improvement; by default never.
-        freeze: Parameters that are not tuned: odometry, odometry[0] ... odometry[3], range,
-            bearing, scale, wall, alignment.
+        freeze: Parameters that are not tuned: odometry_coefficients, odometry_coefficients[0] ...
+            odometry_coefficients[3], range_std, bearing_std, feature_std_scale, wall_angle_std,
+            scan_match_std_scale.
         noise: File of the initial noise parameters (Q and R); by default cautious ones.
         seed: Random seed of the simulation and of the order of the minibatches.
         out: Folder for the results.
     """
     use_cpu_devices()
-    check_range("--steps", steps, 1, 10**5)
+    check_range("--updates", updates, 1, 10**5)
     check_range("--seed", seed, 0, 2**32 - 1)
     check_range("--batch", 1 if batch is None else batch, 1, 10**6)
     check_range("--patience", 1 if patience is None else patience, 1, 10**6)
     if noise is not None and noise.resolve() == (out / PARAMS_FILE).resolve():
         advice = "name another folder by --out"
         raise InputError("would be replaced by the result", path=noise, advice=advice)
-    settings = _Settings(losses.BY_NAME[loss], freeze, steps, batch, seed, patience)
+    settings = _Settings(losses.BY_NAME[loss], freeze, updates, batch, seed, patience)
     with name_errors("--freeze"):
         parameters.trainable_mask(NoiseParams.for_laser_log(match_scans=True), freeze)
     if logs:
-        make_job = recorded_job(logs, test, reference, odometry == "scan", noise, settings.loss)
+        match_scans = odometry == "scan"
+        task = recorded_task(
+            logs, test, reference, noise, match_scans=match_scans, loss=settings.loss
+        )
     else:
         if test or reference:
             raise InputError("apply to logs only", field="--test, --reference")
-        check_range("--runs", runs, 1, 10**6)
+        check_range("--trials", trials, 1, 10**6)
         check_range("--heldout", heldout, 0, 10**6)
-        make_job = simulated_job(world, runs, heldout, noise, seed)
+        task = simulated_task(world, trials, heldout, noise, seed)
+    with name_errors("--freeze"):  # again, of the parameters that this task has
+        parameters.trainable_mask(task.params, freeze)
     with folder(out) as out_dir:
         enable_caches()
         with stopwatch() as seconds:
-            job = make_job()
+            job = task.load()
             found = _tune(job, out, settings)
             with _resumable(out, lambda: "all evaluations"):
                 numbers = _evaluate(job, found, settings)
@@ -130,42 +147,38 @@ def tune(
     summaries.print_tuning_summary(numbers, job.title, out)
 
 
-def _name(loss: Loss) -> str:
-    """Name of a loss, as --loss takes it."""
-    return next(name for name, function in losses.BY_NAME.items() if function is loss)
-
-
 def _tune(job: TuneJob, out: Path, settings: _Settings) -> TuneResult:
     """Tune, resuming from a checkpoint in `out`; write one after each evaluation."""
     about = {
         "config": repr(job.config),
-        "loss": _name(settings.loss),
+        "loss": losses.name_of(settings.loss),
         "frozen": sorted(settings.frozen),
-        "steps": settings.steps,
-        "batch": settings.batch,
+        "updates": settings.num_updates,
+        "batch": settings.batch_size,
         "seed": settings.seed,
         "patience": settings.patience,
-        "noise to start from": job.noise,
-        "runs": _hash(job.train),
+        "noise to start from": job.params,
+        "episodes": _hash(job.train),
         "heldout": _hash(job.test),
     }
-    file, state, steps = out / CHECKPOINT_FILE, None, settings.steps
-    whole = settings.batch is None or settings.batch >= len(job.train.odometry)
+    file, state, num_updates = out / CHECKPOINT_FILE, None, settings.num_updates
+    whole = settings.batch_size is None or settings.batch_size >= len(job.train.odometry)
     if file.exists():
-        optimiser = optimizers.default_optimizer(steps, whole=whole)
-        template = fitting.init(
-            job.noise, num_updates=steps, frozen=settings.frozen, optimizer=optimiser
+        optimizer = optimizers.default_optimizer(num_updates, whole=whole)
+        template = tune_state.init(
+            job.params, num_updates=num_updates, frozen=settings.frozen, optimizer=optimizer
         )
         state = checkpoint.read(file, template, about)
-        print(f"resuming after evaluation {int(state.step)} of {steps + 1}", flush=True)
+        print(f"resuming after evaluation {int(state.step)} of {num_updates + 1}", flush=True)
     done = 0 if state is None else int(state.step)
-    bar = tqdm(total=steps + 1, initial=done, desc="compiling", mininterval=0)
+    bar = tqdm(total=num_updates + 1, initial=done, desc="compiling", mininterval=0)
 
     def save(state: TuneState) -> None:
         nonlocal done
         done = int(state.step)
         out.mkdir(parents=True, exist_ok=True)
-        noise_file.write(out / PARAMS_FILE, fitting.result(state, job.noise, whole=whole).params)
+        best = tune_state.result(state, job.params, whole=whole).params
+        noise_file.write(out / PARAMS_FILE, best)
         checkpoint.write(file, state, about)
         heldout = state.heldout[np.isfinite(state.heldout)]
         postfix = {"loss": f"{state.loss[done - 1]:.4g}"}
@@ -174,14 +187,14 @@ def _tune(job: TuneJob, out: Path, settings: _Settings) -> TuneResult:
         bar.set_postfix(postfix, refresh=False)
         bar.update(done - bar.n)
 
-    with _resumable(out, lambda: done and f"{done} of {steps + 1} evaluations"), bar:
+    with _resumable(out, lambda: done and f"{done} of {num_updates + 1} evaluations"), bar:
         return fitting.tune(
             job.config,
-            job.noise,
+            job.params,
             job.train,
             loss=settings.loss,
-            num_updates=steps,
-            batch_size=settings.batch,
+            num_updates=num_updates,
+            batch_size=settings.batch_size,
             seed=settings.seed,
             frozen=settings.frozen,
             heldout=job.test,
@@ -200,45 +213,47 @@ def _resumable(out: Path, done: Callable[[], str | int]) -> Iterator[None]:
         if not done():
             raise
         raise KeyboardInterrupt(
-            f"interrupted after {done()}; {out / PARAMS_FILE} holds the best parameters so far, and the "
-            "same command resumes"
+            f"interrupted after {done()}; {out / PARAMS_FILE} holds the best parameters so far, "
+            "and the same command resumes"
         ) from None
 
 
 def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
     """Errors before and after the tuning, and standard errors of the parameters."""
-    runs = job.train if job.test is None else job.test
+    evaluated = job.train if job.test is None else job.test
 
-    def errors(noise: NoiseParams) -> Metrics:
-        loss = fitting.values(job.config, noise, runs, settings.loss)
-        numbers = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
-        if runs.truth_mask is None or runs.truth_mask.any():
-            numbers |= summary.evaluate(episodes.filter_episodes(job.config, noise, runs))
+    def errors(params: NoiseParams) -> Metrics:
+        loss = fitting.values(job.config, params, evaluated, settings.loss)
+        numbers: Metrics = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
+        if evaluated.truth_mask is None or evaluated.truth_mask.any():
+            results = episodes.filter_episodes(job.config, params, evaluated)
+            numbers |= summary.evaluate(results)
         return numbers
 
     print("evaluating errors before and after, and standard errors ...", flush=True)
     numbers = errors(found.params) | {
         "judged_on": "the runs it was tuned on" if job.test is None else "held-out runs",
-        "before": errors(job.noise) | {"noise": job.noise},
+        "before": errors(job.params) | {"noise": noise_file.to_keys(job.params)},
         "evaluations": len(found.loss),
         "best": found.best,
         "skipped": int(found.skipped.sum()),
-        "noise": found.params,
+        "noise": noise_file.to_keys(found.params),
         "standard_errors": None,
-        "warnings": ["no standard errors: they need two runs at least"],
+        "warnings": ["no standard errors: they need two episodes at least"],
     }
     if len(job.train.odometry) >= 2:
-        standard_errors = standard_errors_module.standard_errors(
+        sure = standard_errors.standard_errors(
             job.config, found.params, job.train, loss=settings.loss, frozen=settings.frozen
         )
-        relative = dict(zip(standard_errors.names, standard_errors.relative, strict=True))
-        numbers |= {"standard_errors": relative, "warnings": list(standard_errors.warnings)}
+        keys = map(noise_file.key_of, sure.names)
+        numbers["standard_errors"] = dict(zip(keys, sure.relative.tolist(), strict=True))
+        numbers["warnings"] = list(sure.warnings)
     return numbers
 
 
-def _hash(logs: Episode | None) -> str:
-    """Hash of the content of logs."""
+def _hash(episodes: Episode | None) -> str:
+    """Hash of the content of episodes."""
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(logs):
+    for leaf in jax.tree.leaves(episodes):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()[:16]

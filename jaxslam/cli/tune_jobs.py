@@ -1,7 +1,11 @@
-"""What `jaxslam tune` works on: simulated drives, laser logs, landmark logs."""
+"""What `jaxslam tune` works on: simulated drives, laser logs, landmark logs.
+
+A task is checked and its files are read first; only then do its episodes cost time.
+"""
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,15 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli.options import name_errors, read_params
-from jaxslam.cli.tune_command import _name
 from jaxslam.core import time_series
 from jaxslam.core.episode import Episode
+from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import mrclam, readers, tum
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.stacking import stack_episodes
 from jaxslam.simulation import drives, path_following, trials, worlds
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
@@ -27,119 +32,164 @@ from jaxslam.tuning.losses import Loss
 
 
 class TuneJob(NamedTuple):
-    """A tuning task.
+    """A tuning with its episodes.
 
     Attributes:
         config: Configuration of the filter.
-        noise: Initial noise parameters.
-        train: [B] runs to tune on.
-        test: [H] held-out runs to evaluate on; None: evaluate on `train`.
+        params: Initial noise parameters.
+        train: [B] episodes to tune on.
+        test: [H] held-out episodes to evaluate on; None: evaluate on `train`.
         title: Title of the summary.
     """
 
     config: Config
-    noise: NoiseParams
+    params: NoiseParams
     train: Episode
     test: Episode | None
     title: str
 
 
+class TuneTask(NamedTuple):
+    """A tuning whose options and files are checked.
+
+    Attributes:
+        params: Initial noise parameters.
+        load: Makes the episodes, which takes its time.
+    """
+
+    params: NoiseParams
+    load: Callable[[], TuneJob]
+
+
 class _LogFiles(NamedTuple):
-    """Logs that are read and checked, but not yet turned into runs."""
+    """Logs that are read and checked, but not yet turned into episodes.
+
+    Attributes:
+        config: Configuration of the filter.
+        params: Initial noise parameters.
+        train: Functions that make an episode each, to tune on.
+        test: Likewise, held out.
+        no_reference: Paths of logs without a reference.
+        advice: Advice for these.
+    """
 
     config: Config
-    noise: NoiseParams  # initial
-    train: Sequence[Any]
-    test: Sequence[Any]
-    to_run: Callable[[Any], Episode]  # of one of `train` or `test`
-    no_reference: Sequence[Path]  # paths of logs without a reference
-    advice: str  # for them
+    params: NoiseParams
+    train: Sequence[Callable[[], Episode]]
+    test: Sequence[Callable[[], Episode]]
+    no_reference: Sequence[Path]
+    advice: str
 
 
-def simulated_job(
-    world: str, runs: int, heldout: int, noise: Path | None, seed: int
-) -> Callable[[], TuneJob]:
-    """Check the options, and return a function that simulates the runs of the job."""
+def simulated_task(
+    world: str, num_trials: int, num_heldout: int, noise: Path | None, seed: int
+) -> TuneTask:
+    """Check the options of a tuning on simulated trials."""
     with name_errors("--world"):
         walls = World(jnp.asarray(worlds.named(world).walls, float))
         path = jnp.asarray(path_following.densify(worlds.waypoints(world)), float)
-    initial = read_params(noise, NoiseParams.for_laser_log())
+    params = read_params(noise, NoiseParams.for_laser_log())
 
-    def make_job() -> TuneJob:
+    def load() -> TuneJob:
         config, robot = Config(), Robot()
-        steps = drives.num_scans_of_drive(robot, path)
-        total = runs + heldout
-        print(f"simulating {total} runs of {steps} scans, world {world}", flush=True)
-        logs = trials.simulate_episodes(
-            jax.random.key(seed), config, robot, walls, path, num_trials=total, num_scans=steps
+        num_scans = drives.num_scans_of_drive(robot, path)
+        total = num_trials + num_heldout
+        print(f"simulating {total} trials of {num_scans} scans, world {world}", flush=True)
+        simulated = trials.simulate_episodes(
+            jax.random.key(seed),
+            config,
+            robot,
+            walls,
+            path,
+            num_trials=total,
+            num_scans=num_scans,
         )
-        train = jax.tree.map(lambda leaf: np.asarray(leaf)[:runs], logs)
-        test = jax.tree.map(lambda leaf: np.asarray(leaf)[runs:total], logs)
-        title = f"{runs} simulated runs, world {world}"
-        return TuneJob(config, initial, train, test if heldout else None, title)
+        train = jax.tree.map(lambda leaf: np.asarray(leaf)[:num_trials], simulated)
+        test = jax.tree.map(lambda leaf: np.asarray(leaf)[num_trials:total], simulated)
+        title = f"{num_trials} simulated trials, world {world}"
+        return TuneJob(config, params, train, test if num_heldout else None, title)
 
-    return make_job
+    return TuneTask(params, load)
 
 
-def recorded_job(
+def recorded_task(
     logs: Sequence[Path],
     test: Sequence[Path],
     reference: Sequence[Path],
-    aligned: bool,
     noise: Path | None,
+    *,
+    match_scans: bool,
     loss: Loss,
-) -> Callable[[], TuneJob]:
-    """Read and check all files, and return a function that turns them into the runs of the job."""
+) -> TuneTask:
+    """Read and check all files of a tuning on logs."""
     robots = {path: mrclam_robots(path) for path in (*logs, *test)}
-    is_mrclam = {found is not None for found in robots.values()}
-    if len(is_mrclam) > 1:
+    if len({found is None for found in robots.values()}) > 1:
         raise InputError("laser logs and MRCLAM data sets are tuned separately", field="LOG")
-    if is_mrclam == {True}:
+    if None not in robots.values():
         if reference:
             raise InputError("MRCLAM data sets contain theirs", field="--reference")
         files = _read_mrclam(
-            [robot for path in logs for robot in robots[path]],
-            [robot for path in test for robot in robots[path]],
+            [robot for path in logs for robot in robots[path] or ()],
+            [robot for path in test for robot in robots[path] or ()],
             noise,
         )
     else:
-        files = _read_laser_logs(logs, test, reference, aligned, noise)
+        files = _read_laser_logs(logs, test, reference, noise, match_scans=match_scans)
     if losses.needs_truth(loss) and files.no_reference:
-        problem = f"has no reference, which the loss {_name(loss)} needs"
+        problem = f"has no reference, which the loss {losses.name_of(loss)} needs"
         raise InputError(problem, path=files.no_reference[0], advice=files.advice)
 
-    def make_job() -> TuneJob:
-        train = [files.to_run(log) for log in files.train]
-        held_out = [files.to_run(log) for log in files.test]
+    def load() -> TuneJob:
+        train = [make_episode() for make_episode in files.train]
+        heldout = [make_episode() for make_episode in files.test]
         count = f"{len(train)} log{'s' if len(train) > 1 else ''}"
-        title = f"{count}, {sum(len(run.truth) for run in train)} steps"
-        print(f"{title}; held out: {len(held_out)}", flush=True)
-        held_out = episodes.stack_episodes(held_out) if held_out else None
-        return TuneJob(files.config, files.noise, episodes.stack_episodes(train), held_out, title)
+        title = f"{count}, {sum(len(episode.truth) for episode in train)} steps"
+        print(f"{title}; held out: {len(heldout)}", flush=True)
+        width = max(episode.features.valid.shape[1] for episode in (*train, *heldout))
+        train, heldout = ([_widened(x, width) for x in some] for some in (train, heldout))
+        held_out = stack_episodes(heldout) if heldout else None
+        return TuneJob(files.config, files.params, stack_episodes(train), held_out, title)
 
-    return make_job
+    return TuneTask(files.params, load)
+
+
+def _widened(episode: Episode, width: int) -> Episode:
+    """An episode whose steps hold `width` features, the last of them padding."""
+    missing = width - episode.features.valid.shape[1]
+    if not missing:
+        return episode
+
+    def pad(x: Any, value: int = 0) -> Any:
+        ends = [(0, 0), (0, missing)] + [(0, 0)] * (np.ndim(x) - 2)
+        return np.pad(np.asarray(x), ends, constant_values=value)
+
+    ids = episode.landmark_ids
+    return episode._replace(
+        features=jax.tree.map(pad, episode.features),
+        landmark_ids=None if ids is None else pad(ids, -1),
+    )
 
 
 def _read_mrclam(
     train: Sequence[tuple[Path, int]], test: Sequence[tuple[Path, int]], noise: Path | None
 ) -> _LogFiles:
     """Read robots (folder, number) of MRCLAM data sets."""
-    initial = read_params(noise, NoiseParams.for_landmark_sensor())
+    params = read_params(noise, NoiseParams.for_landmark_sensor())
     robots = [*train, *test]
-    read = [mrclam.read(path, robot) for path, robot in robots]
+    logs = [mrclam.read(path, robot) for path, robot in robots]
     no_reference = [
         path / f"Robot{robot}"
-        for (path, robot), log in zip(robots, read, strict=True)
+        for (path, robot), log in zip(robots, logs, strict=True)
         if not log.truth_mask.any()
     ]
+    makers = [partial(episodes.episode_from_landmark_log, log) for log in logs]
     return _LogFiles(
-        episodes.landmark_log_config(read),
-        initial,
-        read[: len(train)],
-        read[len(train) :],
-        episodes.episode_from_landmark_log,
+        episodes.landmark_log_config(logs),
+        params,
+        makers[: len(train)],
+        makers[len(train) :],
         no_reference,
-        "use --loss likelihood",
+        "use --loss innovation_nll",
     )
 
 
@@ -147,40 +197,43 @@ def _read_laser_logs(
     train: Sequence[Path],
     test: Sequence[Path],
     reference: Sequence[Path],
-    aligned: bool,
     noise: Path | None,
+    *,
+    match_scans: bool,
 ) -> _LogFiles:
     """Read laser logs of one scanner with their reference trajectories, if there are any."""
-    initial = read_params(noise, NoiseParams.for_laser_log(match_scans=aligned))
+    params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     paths = [*train, *test]
-    read = [readers.read(path) for path in paths]
-    if reference and len(reference) != len(read):
-        problem = f"{len(reference)} files for {len(read)} logs"
+    logs = [readers.read_log(path) for path in paths]
+    if reference and len(reference) != len(logs):
+        problem = f"{len(reference)} files for {len(logs)} logs"
         raise InputError(problem, field="--reference", advice="give one for each log, in order")
-    references = [tum.read(path) for path in reference] or [None] * len(read)
-    for path, log in zip(paths, read, strict=True):
-        if log.lidar != read[0].lidar:
+    references: list[Trajectory | None] = [tum.read(path) for path in reference]
+    for path, log in zip(paths, logs, strict=True):
+        if log.lidar != logs[0].lidar:
             problem = f"has another scanner than {paths[0]}"
             raise InputError(problem, path=path, advice="tune them separately")
-    config = episodes.laser_log_config(read)
-    for path, log, trajectory in zip(reference, read, references, strict=False):
-        if not time_series.match_times(log.times, trajectory[0]).size:
+    with name_errors(str(paths[0])):
+        config = episodes.laser_log_config(logs)
+        config.check()
+    for path, log, trajectory in zip(reference, logs, references, strict=False):
+        if trajectory is None or not time_series.match_times(log.times, trajectory[0]).size:
             advice = "compare their clocks, and the order of --reference"
             raise InputError("has no pose at the time of a scan", path=path, advice=advice)
 
-    def to_run(pair: tuple[Any, Trajectory | None]) -> Episode:
-        log, trajectory = pair
-        return episodes.episode_from_laser_log(config, log, trajectory, match_scans=aligned)
+    def make_episode(path: Path, log: LaserLog, trajectory: Trajectory | None) -> Episode:
+        with name_errors(str(path)):
+            return episodes.episode_from_laser_log(config, log, trajectory, match_scans=match_scans)
 
-    pairs = list(zip(read, references, strict=True))
+    given = zip(paths, logs, references or [None] * len(logs), strict=True)
+    makers = [partial(make_episode, *of_one) for of_one in given]
     return _LogFiles(
         config,
-        initial,
-        pairs[: len(train)],
-        pairs[len(train) :],
-        to_run,
+        params,
+        makers[: len(train)],
+        makers[len(train) :],
         [] if reference else train,
-        "give --reference, or use --loss likelihood",
+        "give --reference, or use --loss innovation_nll",
     )
 
 

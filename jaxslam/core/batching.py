@@ -16,7 +16,7 @@ from jaxslam.core.types import Array
 def sequential_vmap_on_cpu(function: Callable) -> Callable:
     """`function` whose `jax.vmap` is a loop over the batch on a CPU, and a plain vmap elsewhere.
 
-        vmap(one_by_one(f))(x)  =  lax.map(f, x)  on a CPU,  vmap(f)(x)  on other platforms
+        vmap(sequential_vmap_on_cpu(f))(x)  =  lax.map(f, x)  on a CPU,  vmap(f)(x)  elsewhere
 
     On a CPU the arrays of one item stay in the cache, a `lax.cond` stays a branch, and results are
     computed once: XLA fuses operations on a whole batch that it takes for cheap into each of
@@ -42,7 +42,7 @@ def sequential_vmap_on_cpu(function: Callable) -> Callable:
                 next(remaining) if own else shared
                 for shared, own in zip(leaves, has_batch_axis, strict=True)
             ]
-            return called(*treedef.unflatten(merged))
+            return called(*jax.tree.unflatten(treedef, merged))
 
         loop = partial(lax.map, partial(on_item, sequential))
         vectorised = jax.vmap(partial(on_item, function))
@@ -57,13 +57,47 @@ def map_batches(function: Callable, items: Any, *, batch_size: int) -> Any:
 
     The last batch is filled up with copies of the last item: unlike `lax.map(batch_size=...)`
     this compiles the function once.
+
+    Args:
+        function: Of one item, an array or a record of arrays.
+        items: Arrays of NumPy or JAX that lead with the number of items, at least one.
+        batch_size: Items of a batch.
+
+    Returns:
+        The results, arrays that lead with the number of items.
+
+    Raises:
+        ValueError: There are no items, their arrays differ in length, or `batch_size` is below 1.
     """
-    count = jax.tree.leaves(items)[0].shape[0]
+    count = leading_size("items", items)
+    if batch_size < 1:
+        raise ValueError(f"batch_size is {batch_size}, not 1 or more")
     batch_size = min(batch_size, count)
     items = pad_to(items, to=count + -count % batch_size)
     batches = jax.tree.map(lambda x: x.reshape((-1, batch_size) + x.shape[1:]), items)
     result = lax.map(jax.vmap(function), batches)
     return jax.tree.map(lambda x: x.reshape((-1,) + x.shape[2:])[:count], result)
+
+
+def leading_size(name: str, items: Any) -> int:
+    """The number of items: the length of all arrays of a record.
+
+    Args:
+        name: Name of `items`, for the message.
+        items: Arrays of NumPy or JAX, or a record of them.
+
+    Raises:
+        ValueError: There are no arrays, one has no axes or no entries, or their lengths differ.
+    """
+    shapes = [np.shape(x) for x in jax.tree.leaves(items)]
+    if not shapes or () in shapes:
+        raise ValueError(f"{name} has shapes {shapes}, not those of arrays with a leading axis")
+    lengths = sorted({shape[0] for shape in shapes})
+    if len(lengths) > 1:
+        raise ValueError(f"{name} holds arrays of different lengths: {lengths}")
+    if not lengths[0]:
+        raise ValueError(f"{name} is empty")
+    return lengths[0]
 
 
 def pad_to(items: Any, *, to: int) -> Any:
@@ -73,7 +107,7 @@ def pad_to(items: Any, *, to: int) -> Any:
         missing = to - x.shape[0]
         if not missing:
             return x
-        numpy = jnp if isinstance(x, jax.Array) else np
-        return numpy.concatenate([x, numpy.repeat(x[-1:], missing, axis=0)])
+        xp = jnp if isinstance(x, jax.Array) else np
+        return xp.concatenate([x, xp.repeat(x[-1:], missing, axis=0)])
 
     return jax.tree.map(lengthen, items)

@@ -12,10 +12,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import pad_to
+from jaxslam.core.batching import leading_size, pad_to
 from jaxslam.core.types import Array
 
-XLA_FLAGS = {  # of XLA
+XLA_FLAGS = {
     "--xla_force_host_platform_device_count": "{cores}",
     # By default XLA splits operations among the threads of all devices, and these are short.
     "--xla_disable_hlo_passes": "cpu-parallel-task-assigner",
@@ -31,8 +31,13 @@ def use_cpu_devices(num_devices: int | None = None) -> None:
 
     Args:
         num_devices: Number of devices; by default all cores that this process may use.
+
+    Raises:
+        ValueError: `num_devices` is below 1.
     """
-    first_platform = (jax.config.jax_platforms or "cpu").split(",")[0]
+    if num_devices is not None and num_devices < 1:
+        raise ValueError(f"num_devices is {num_devices}, not 1 or more")
+    first_platform = (trace_cache.setting("jax_platforms") or "cpu").split(",")[0]
     if first_platform != "cpu" or _backends_started():
         return
     count = num_devices or num_cores()
@@ -48,7 +53,7 @@ def _backends_started() -> bool:
     JAX has no public function that says so without starting the backends, so a change is tried
     and undone.
     """
-    devices = jax.config.jax_num_cpu_devices
+    devices = trace_cache.setting("jax_num_cpu_devices")
     try:
         jax.config.update("jax_num_cpu_devices", max(0, devices) + 1)
     except RuntimeError:
@@ -96,7 +101,14 @@ class DeviceMap:
             function: Of `static` hashable arguments, one record common to all items, and one item.
             size: Items of a batch; a single one is not vectorised.
             static: Number of leading arguments that are static under jit.
+
+        Raises:
+            ValueError: `size` is below 1, or `static` below 0.
         """
+        if size < 1:
+            raise ValueError(f"size is {size}, not 1 or more")
+        if static < 0:
+            raise ValueError(f"static is {static}, not 0 or more")
         self.size = size
         self._function = function
         self._static = static
@@ -108,6 +120,10 @@ class DeviceMap:
             args: The static arguments, the common record, and the items: arrays that lead with
                 their number.
             devices: To be used, as many of each process; all by default.
+
+        Raises:
+            ValueError: There are too few or too many arguments, no items, or arrays of items that
+                differ in length.
         """
         return self.begin(*args, devices=devices)()
 
@@ -116,10 +132,16 @@ class DeviceMap:
 
         Returns:
             A function without arguments that waits for the results and returns them.
+
+        Raises:
+            ValueError: As of a call.
         """
+        if len(args) != self._static + 2:
+            wanted = f"{self._static} static ones, the common record and the items"
+            raise ValueError(f"{len(args)} arguments, not {wanted}")
         static, (common, items) = args[: self._static], args[self._static :]
+        count = leading_size("items", items)
         mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("items",))
-        count = jax.tree.leaves(items)[0].shape[0]
         size = min(self.size, -(-count // mesh.size))
         rounds = -(-count // (size * mesh.size))
         items = pad_to(items, to=mesh.size * rounds * size)
@@ -172,7 +194,8 @@ def _run(program: tuple, common: Any, items: Any) -> Any:
         common: The record common to all items.
         items: The batch: arrays that lead with its size.
     """
-    function = partial(*program, common)
+    called, *static = program
+    function = partial(called, *static, common)
     if jax.tree.leaves(items)[0].shape[0] > 1:
         return jax.vmap(function)(items)
     single = function(jax.tree.map(lambda x: x[0], items))

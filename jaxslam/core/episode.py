@@ -1,4 +1,4 @@
-"""An episode: what one robot measured on one drive, simulated or recorded, and where it truly was."""
+"""An episode: the measurements of one robot on one drive, and its true poses."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,11 @@ class Episode(NamedTuple):
         truth: (T, 3) [m, m, rad] pose at each scan, world frame; the filter starts at the first.
         odometry: (T, 3) [m, m, rad] odometry increment since the scan before, zero at the first.
         features: [T] features of each scan, robot frame.
-        landmark_ids: (T, M) int32 landmark of each feature, -1 unknown; None: data association is run.
-        truth_mask: (T,) bool True where `truth` is known and errors count; None: everywhere.
+        landmark_ids: (T, M) int32 landmark of each feature, -1 for none; None: the filter
+            associates.
+        truth_mask: (T,) bool, where `truth` is known and errors count; None: everywhere.
         num_steps: () int32 number of scans, those after it are padding; None: T.
-        scan_matches: [T] odometry increments by scan matching, fused with `robot`; None: not used.
+        scan_matches: [T] increments by scan matching, fused with the odometry; None: not used.
     """
 
     truth: Array

@@ -12,14 +12,14 @@ class Features(NamedTuple):
     """Features of one scan, of all three kinds, padded to M; robot frame.
 
     Attributes:
-        kind: (M,) int32, `JUNCTION` (a junction), `CORNER` or `WALL`.
+        kind: (M,) int32, `JUNCTION`, `CORNER` or `WALL`.
         xy: (M, 2) [m] position; zero for a wall direction.
         cov: (M, 2, 2) [m^2] covariance of the position.
         direction: (M,) [rad] of a corner: bisector of its free side; of a wall: of its line, in
             [-pi/2, pi/2); 0 for a junction.
         direction_variance: (M,) [rad^2] of a wall's direction.
-        descriptor: (M,) descriptor. Junction: clearance [m]; corner: angle of its free side [rad]; 0 for
-            a wall.
+        descriptor: (M,) clearance [m] of a junction; angle [rad] of the free side of a corner; 0
+            for a wall.
         degree: (M,) int32 number of walls that the circle of a junction touches.
         certified: (M,) bool, all of the circle of a junction was seen.
         trusted: (M,) bool, may start a new landmark; the others are only matched with known ones.
@@ -49,7 +49,7 @@ def zero_padding(features: Features) -> Features:
 
 
 def restrict_features(features: Features, wanted: Array) -> Features:
-    """Blank the features that are not valid, not `wanted` (M,) bool, or hold NaN or infinity."""
+    """Mark as padding the features that are not `wanted` (M,) bool, or hold NaN or infinity."""
     numbers = (
         features.xy,
         features.cov,

@@ -141,10 +141,10 @@ def downdate_rarely(matrix: Array, y: Array, wanted: Array) -> Array:
         y: (k, n); zero where not `wanted`.
         wanted: () bool.
     """
-    return _lower_fwd(matrix, y, wanted)[0]
+    return _downdate_fwd(matrix, y, wanted)[0]
 
 
-def _lower_fwd(matrix: Array, y: Array, wanted: Array) -> tuple[Array, tuple[Array, Array]]:
+def _downdate_fwd(matrix: Array, y: Array, wanted: Array) -> tuple[Array, tuple[Array, Array]]:
     def downdate(matrix: Array, y: Array) -> Array:
         return add_outer_products(matrix, y, y, sign=-1)
 
@@ -154,7 +154,7 @@ def _lower_fwd(matrix: Array, y: Array, wanted: Array) -> tuple[Array, tuple[Arr
     return cond_rarely(wanted, downdate, unchanged, matrix, y), (y, wanted)
 
 
-def _lower_bwd(saved: tuple[Array, Array], grad_out: Array) -> tuple[Array, Array, None]:
+def _downdate_bwd(saved: tuple[Array, Array], grad_out: Array) -> tuple[Array, Array, None]:
     y, wanted = saved
 
     def grad_y(grad_out: Array, y: Array) -> Array:
@@ -166,7 +166,7 @@ def _lower_bwd(saved: tuple[Array, Array], grad_out: Array) -> tuple[Array, Arra
     return grad_out, cond_rarely(wanted, grad_y, no_grad_y, grad_out, y), None
 
 
-downdate_rarely.defvjp(_lower_fwd, _lower_bwd)
+downdate_rarely.defvjp(_downdate_fwd, _downdate_bwd)
 
 
 @jax.custom_vjp

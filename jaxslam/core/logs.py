@@ -1,16 +1,17 @@
 """Recorded logs, as the readers return them: laser scans, landmark measurements, relations."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from jaxslam.core.scan import Lidar
+from jaxslam.core.scan import Lidar, check_lidar
+from jaxslam.core.types import as_float64
 
 DEFAULT_RANGE_STD = 0.02
 """Standard deviation [m] of a range; logs do not state it."""
 
 DEFAULT_RANGE_MAX = 20.0
-"""Default range_max [m] of an indoor scanner: from here on a reading counts as no return."""
+"""Range [m] of an indoor scanner from which on a reading counts as no return, by default."""
 
 MAX_BROKEN_FRACTION = 0.05
 """Fraction of a log's lines or scans that may be broken; they are skipped and counted."""
@@ -28,10 +29,10 @@ class LaserLog(NamedTuple):
         lidar: The scanner.
         num_skipped: Number of broken lines, or of scans without odometry, left out.
         odom_stream_times: (N,) float64 [s] of the whole odometry stream.
-        odom_stream_poses: (N, 3) float64 [m, m, rad] of the odometry stream; those of the scans if the
-            log has no separate stream.
+        odom_stream_poses: (N, 3) float64 [m, m, rad] of the odometry stream; those of the scans if
+            the log has no separate stream.
         source: Topics that were read, for messages; "" where there is no choice.
-        odometry_repairs: Odometry repairs: what was wrong with the odometry and has been corrected.
+        odometry_repairs: What was wrong with the odometry and has been corrected.
     """
 
     times: np.ndarray
@@ -43,6 +44,57 @@ class LaserLog(NamedTuple):
     odom_stream_poses: np.ndarray
     source: str = ""
     odometry_repairs: tuple[str, ...] = ()
+
+    @classmethod
+    def from_arrays(
+        cls,
+        times: Any,
+        odom_poses: Any,
+        ranges: Any,
+        lidar: Lidar,
+        *,
+        odom_stream_times: Any = None,
+        odom_stream_poses: Any = None,
+    ) -> Self:
+        """A log made of arrays, lists or JAX arrays, which are checked and copied.
+
+        Args:
+            times: (T,) [s] of each scan, T >= 1.
+            odom_poses: (T, 3) [m, m, rad] pose of the scanner by odometry at each scan.
+            ranges: (T, R) [m]; NaN, infinite, not above 0 or not below `lidar.range_max` where
+                there is no return.
+            lidar: The scanner, of R >= 2 beams.
+            odom_stream_times: (N,) [s] of the whole odometry stream, if there is more of it than
+                the poses of the scans.
+            odom_stream_poses: (N, 3) [m, m, rad] of the odometry stream.
+
+        Raises:
+            ValueError: An argument has another shape, is not numbers or not finite; the scanner is
+                impossible; or one of the last two arguments is given without the other.
+        """
+        check_lidar(lidar)
+        times = _finite("times", times, ("T",))
+        if not times.size:
+            raise ValueError("times is empty: a log has at least one scan")
+        odom_poses = _finite("odom_poses", odom_poses, (times.size, 3))
+        ranges = as_float64("ranges", ranges, (times.size, lidar.num_beams))
+        if (odom_stream_times is None) != (odom_stream_poses is None):
+            raise ValueError("odom_stream_times and odom_stream_poses: give both or neither")
+        if odom_stream_times is None:
+            odom_stream_times, odom_stream_poses = times, odom_poses
+        odom_stream_times = _finite("odom_stream_times", odom_stream_times, ("N",))
+        odom_stream_poses = _finite(
+            "odom_stream_poses", odom_stream_poses, (odom_stream_times.size, 3)
+        )
+        return cls(
+            times=times,
+            odom_poses=odom_poses,
+            ranges=mark_no_return(ranges, lidar.range_max),
+            lidar=lidar,
+            num_skipped=0,
+            odom_stream_times=odom_stream_times,
+            odom_stream_poses=odom_stream_poses,
+        )
 
 
 class LandmarkLog(NamedTuple):
@@ -77,23 +129,6 @@ class LandmarkLog(NamedTuple):
     num_skipped: int
 
 
-def mark_no_return(ranges: np.ndarray, range_max: float) -> np.ndarray:
-    """Mark readings that are no return.
-
-    Args:
-        ranges: Any shape [m].
-        range_max: range_max [m].
-
-    Returns:
-        The ranges as float32, infinite where they are not above zero or not below `range_max`.
-    """
-    ranges = ranges.copy()
-    ranges[~((ranges > 0.0) & (ranges < np.float32(range_max)))] = np.inf
-    ranges = ranges.astype(np.float32)
-    ranges[ranges >= np.float32(range_max)] = np.inf
-    return ranges
-
-
 class Relations(NamedTuple):
     """N relative poses between two times of a log.
 
@@ -109,3 +144,29 @@ class Relations(NamedTuple):
     t1: np.ndarray
     t2: np.ndarray
     relative_pose: np.ndarray
+
+
+def mark_no_return(ranges: np.ndarray, range_max: float) -> np.ndarray:
+    """Mark readings that are no return.
+
+    Args:
+        ranges: Floats of any shape [m].
+        range_max: Range [m] from which on a reading counts as no return.
+
+    Returns:
+        The ranges as float32, infinite where they are not above zero or not below `range_max`.
+    """
+    ranges = ranges.copy()
+    ranges[~((ranges > 0.0) & (ranges < np.float32(range_max)))] = np.inf
+    ranges = ranges.astype(np.float32)
+    ranges[ranges >= np.float32(range_max)] = np.inf
+    return ranges
+
+
+def _finite(name: str, x: Any, shape: tuple[Any, ...]) -> np.ndarray:
+    """A copy of numbers as float64 of this shape; raise ValueError if one is not finite."""
+    numbers = as_float64(name, x, shape).copy()
+    if not np.isfinite(numbers).all():
+        index = tuple(np.argwhere(~np.isfinite(numbers))[0].tolist())
+        raise ValueError(f"{name}{list(index)} is {numbers[index]}, not a finite number")
+    return numbers

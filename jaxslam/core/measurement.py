@@ -13,7 +13,7 @@ class ScanMatch(NamedTuple):
         increment: (3,) [m, m, rad].
         information: (3, 3) inverse covariance, from the scan alone; zero in directions that it does
             not constrain.
-        inlier_fraction: () inlier fraction: part of the points that lie on a surface of the map.
+        inlier_fraction: () fraction of the points that lie on a surface of the submap.
     """
 
     increment: Array
@@ -26,8 +26,9 @@ class Measurement(NamedTuple):
 
     Attributes:
         odometry: (3,) [m, m, rad] odometry since the scan before, frame of the pose before.
-        features: (M) features of this scan, base_link frame.
-        landmark_ids: (M,) int32 known landmark 0..L-1 of each feature, -1 for none; None: associate.
+        features: M features of this scan, robot frame.
+        landmark_ids: (M,) int32 known landmark 0..L-1 of each feature, -1 for none; None: the
+            filter associates.
         scan_match: The same increment by scan matching, to be fused with the odometry, if any.
     """
 

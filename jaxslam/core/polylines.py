@@ -1,20 +1,21 @@
-"""Polylines in JAX and in NumPy: length, resampling, projection."""
+"""Polylines, of JAX arrays or of NumPy arrays: length, resampling, projection.
 
+`resample` and `points_along` take both kinds: JAX arrays, traced ones too, give JAX arrays, and
+everything else gives NumPy arrays. The other functions are for the host alone.
+"""
+
+from typing import Any, TypeVar
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.types import Array
+from jaxslam.core.types import AnyArray
 
+ArrayT = TypeVar("ArrayT", jax.Array, np.ndarray)
 
-def resample(way: Array, count: int) -> Array:
-    """Points (count, 2) [m] at equal distances along a polyline (n, 2) [m], its ends included."""
-    size = jnp.sqrt(jnp.sum(jnp.diff(way, axis=0) ** 2, axis=1))
-    along = jnp.concatenate([jnp.zeros(1, size.dtype), jnp.cumsum(size)])
-    wanted = along[-1] * jnp.linspace(0.0, 1.0, count, dtype=size.dtype)
-    return jnp.stack([jnp.interp(wanted, along, way[:, k]) for k in range(2)], axis=1)
-
-
-DEFAULT_POINTS = 9  # points to which a polyline is resampled to be compared, and of a driven arc
+DEFAULT_POINTS = 9
+"""Points to which a polyline is resampled to be compared, and points of a driven arc."""
 
 
 def length(line: np.ndarray) -> np.ndarray:
@@ -24,14 +25,42 @@ def length(line: np.ndarray) -> np.ndarray:
 
 def cumulative_lengths(line: np.ndarray) -> np.ndarray:
     """Length (n,) [m] along a polyline (n, 2) from its first point to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return np.asarray(_cumulative_lengths(np, np.asarray(line)))
 
 
-def resample_np(line: np.ndarray, count: int = DEFAULT_POINTS) -> np.ndarray:
-    """Points (count, 2) at equal distances along a polyline (n, 2) [m], its ends included."""
-    at_point = cumulative_lengths(line)
-    wanted = np.linspace(0.0, at_point[-1], count)
-    return np.stack([np.interp(wanted, at_point, line[:, axis]) for axis in range(2)], axis=1)
+def resample(line: ArrayT, count: int = DEFAULT_POINTS) -> ArrayT:
+    """Points (count, 2) [m] at equal distances along a polyline (n, 2) [m], its ends included."""
+    xp, points = _module(line)
+    at_point = _cumulative_lengths(xp, points)
+    if xp is np:
+        return _interpolate(np, points, at_point, np.linspace(0.0, float(at_point[-1]), count))
+    fraction = jnp.linspace(0.0, 1.0, count, dtype=at_point.dtype)
+    return _interpolate(jnp, points, at_point, at_point[-1] * fraction)
+
+
+def points_along(line: ArrayT, distances: AnyArray) -> ArrayT:
+    """Points (N, 2) [m] at `distances` (N,) [m] along a polyline (n, 2) [m] from its first point.
+
+    Distances below zero give the first point, those beyond the end the last one.
+    """
+    xp, points = _module(line)
+    return _interpolate(xp, points, _cumulative_lengths(xp, points), xp.asarray(distances))
+
+
+def _module(line: AnyArray) -> tuple[Any, Any]:
+    """The array module of a polyline, and the polyline as its array."""
+    return (jnp, line) if isinstance(line, jax.Array) else (np, np.asarray(line))
+
+
+def _cumulative_lengths(xp: Any, line: Any) -> Any:
+    """As `cumulative_lengths`, with the array module of the polyline."""
+    step = xp.linalg.norm(xp.diff(line, axis=0), axis=1)
+    return xp.concatenate([xp.zeros(1, step.dtype), xp.cumsum(step)])
+
+
+def _interpolate(xp: Any, line: Any, at_point: Any, wanted: Any) -> Any:
+    """Points (N, 2) at lengths `wanted` (N,), between points (n, 2) at the lengths `at_point`."""
+    return xp.stack([xp.interp(wanted, at_point, line[:, axis]) for axis in range(2)], axis=1)
 
 
 def project(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

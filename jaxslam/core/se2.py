@@ -1,19 +1,13 @@
-"""Angles, SE(2) poses and polar form, in JAX."""
+"""Angles, SE(2) poses and polar form, in JAX; `se2_np` is the same for logs, in NumPy.
 
+A pose (3,) is x [m], y [m] and heading [rad] of a frame in another one (glossary: `types`).
+"""
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.core.types import Array
-
-
-def dead_reckoning(start: Array, odometry: Array) -> Array:
-    """Poses (T, 3) by composing odometry increments (T, 3) from the pose `start` (3,)."""
-
-    def body(pose, increment):
-        pose = compose(pose, increment)
-        return pose, pose
-
-    return lax.scan(body, start, odometry)[1]
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -32,14 +26,14 @@ def rotation(angle: Array) -> Array:
     return jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
 
 
-def compose(pose: Array, motion: Array) -> Array:
-    """Pose (3,) after `robot` (3,), given in the frame of `pose` (3,): pose (+) motion."""
+def compose(pose: Array, increment: Array) -> Array:
+    """Pose (3,) after an increment (3,), given in the frame of `pose` (3,): pose (+) increment."""
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     return jnp.stack(
         [
-            pose[0] + cos * motion[0] - sin * motion[1],
-            pose[1] + sin * motion[0] + cos * motion[1],
-            wrap_angle(pose[2] + motion[2]),
+            pose[0] + cos * increment[0] - sin * increment[1],
+            pose[1] + sin * increment[0] + cos * increment[1],
+            wrap_angle(pose[2] + increment[2]),
         ]
     )
 
@@ -64,6 +58,36 @@ def inverse_transform(pose: Array, points: Array) -> Array:
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y = points[..., 0] - pose[0], points[..., 1] - pose[1]
     return jnp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+
+
+def dead_reckoning(start: Array, increments: Array) -> Array:
+    """Poses by composing increments, one after the other.
+
+        poses[0] = start (+) increments[0],     poses[t] = poses[t - 1] (+) increments[t]
+
+    Args:
+        start: (3,) [m, m, rad].
+        increments: (T, 3) [m, m, rad], each in the frame of the pose before it; where the first is
+            zero, the first pose is `start`.
+
+    Returns:
+        (T, 3) [m, m, rad], in the frame of `start`.
+    """
+
+    def body(pose: Array, increment: Array) -> tuple[Array, Array]:
+        pose = compose(pose, increment)
+        return pose, pose
+
+    return lax.scan(body, start, increments)[1]
+
+
+def increments(poses: Array) -> Array:
+    """Increments (T, 3) to each of poses (T, 3) from the one before, in its frame; zero at first.
+
+    The inverse of `dead_reckoning` from the first pose.
+    """
+    first = jnp.zeros((1, 3), poses.dtype)
+    return jnp.concatenate([first, jax.vmap(relative)(poses[:-1], poses[1:])])
 
 
 def range_bearing(offset: Array) -> Array:

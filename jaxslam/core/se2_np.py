@@ -1,51 +1,68 @@
-"""SE(2) poses in NumPy and float64, for logs and metrics; `se2` is the same in JAX."""
+"""SE(2) poses in NumPy, for logs and metrics; `se2` is the same in JAX, with the same names.
+
+Frames and poses may lead with any axes here, and dtypes follow NumPy's rules: float64 for logs.
+"""
 
 import numpy as np
 
 
-def compose(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Poses (..., 3) after motions (..., 3), given in their frames; as `se2.compose`."""
+def wrap_angle(angle: np.ndarray) -> np.ndarray:
+    """Return the same angle [rad] in [-pi, pi)."""
+    return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
+
+
+def compose(pose: np.ndarray, increment: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) after increments (..., 3), given in the frames of `pose`."""
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + cos * motion[..., 0] - sin * motion[..., 1]
-    y = pose[..., 1] + sin * motion[..., 0] + cos * motion[..., 1]
-    return np.stack([x, y, wrap_angle(pose[..., 2] + motion[..., 2])], axis=-1)
+    x = pose[..., 0] + cos * increment[..., 0] - sin * increment[..., 1]
+    y = pose[..., 1] + sin * increment[..., 0] + cos * increment[..., 1]
+    return np.stack([x, y, wrap_angle(pose[..., 2] + increment[..., 2])], axis=-1)
 
 
-def relative(frames: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses (..., 3) relative to the frames (..., 3), in them; as `se2.relative`."""
-    cos, sin = np.cos(frames[..., 2]), np.sin(frames[..., 2])
-    gap = poses - frames
+def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Poses `b` (..., 3) relative to poses `a` (..., 3): the inverse of `compose`."""
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    gap = b - a
     x, y = cos * gap[..., 0] + sin * gap[..., 1], cos * gap[..., 1] - sin * gap[..., 0]
     return np.stack([x, y, wrap_angle(gap[..., 2])], axis=-1)
 
 
-def transform(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Transform points (..., 2) [m] from the frames of poses (..., 3) to that of the poses.
-
-    As `se2.transform`.
-    """
-    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+def transform(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Transform points (..., 2) [m] from the frames at poses (..., 3) to that of the poses."""
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x, y = points[..., 0], points[..., 1]
-    return np.stack([poses[..., 0] + cos * x - sin * y, poses[..., 1] + sin * x + cos * y], axis=-1)
+    return np.stack([pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y], axis=-1)
 
 
-def chain(moves: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Trajectory of increments: dead reckoning.
+def inverse_transform(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Transform points (..., 2) [m] to the frames at poses (..., 3) from that of the poses."""
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x, y = points[..., 0] - pose[..., 0], points[..., 1] - pose[..., 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+
+
+def dead_reckoning(start: np.ndarray, increments: np.ndarray) -> np.ndarray:
+    """Poses by composing increments, one after the other.
+
+        poses[0] = start (+) increments[0],     poses[t] = poses[t - 1] (+) increments[t]
 
     Args:
-        moves: (N, 3) increments, each in the frame of the pose before it.
-        start: (3,) first pose; zero by default.
+        start: (3,) [m, m, rad].
+        increments: (T, 3) [m, m, rad], each in the frame of the pose before it; where the first is
+            zero, the first pose is `start`.
 
     Returns:
-        (N + 1, 3) poses.
+        (T, 3) float64 [m, m, rad], in the frame of `start`.
     """
-    poses = np.zeros((len(moves) + 1, 3))
-    poses[0] = 0.0 if start is None else start
-    for i, move in enumerate(moves):
-        poses[i + 1] = compose(poses[i], move)
+    poses, pose = np.zeros((len(increments), 3)), np.asarray(start, float)
+    for index, increment in enumerate(increments):
+        pose = poses[index] = compose(pose, increment)
     return poses
 
 
-def wrap_angle(angle: np.ndarray) -> np.ndarray:
-    """As `se2.wrap_angle`."""
-    return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
+def increments(poses: np.ndarray) -> np.ndarray:
+    """Increments (T, 3) to each of poses (T, 3) from the one before, in its frame; zero at first.
+
+    The inverse of `dead_reckoning` from the first pose.
+    """
+    return np.concatenate([np.zeros((1, 3)), relative(poses[:-1], poses[1:])])

@@ -59,6 +59,9 @@ from jax import export
 from jax.sharding import SingleDeviceSharding
 
 PACKAGE = __name__.split(".")[0]
+HOME = Path(__file__).parents[1]
+"""Folder of the package's sources."""
+
 SETTINGS = (  # options of JAX that the traced program depends on
     "jax_enable_x64",
     "jax_default_matmul_precision",
@@ -76,6 +79,11 @@ def enable() -> None:
     """Turn the cache on for this process; it works where `jax_compilation_cache_dir` is set."""
     global _enabled
     _enabled = True
+
+
+def setting(name: str) -> Any:
+    """Value of an option of JAX; options are attributes that JAX does not declare."""
+    return getattr(jax.config, name)
 
 
 class _Key(NamedTuple):
@@ -100,12 +108,12 @@ class CachedJit:
     """A jitted function with a persistent trace; made by `jit`."""
 
     def __init__(self, function: Callable, static: tuple[str, ...]):
-        """Wrap a function, whose arguments called as in `static` are static."""
+        """Wrap a function, whose arguments with names in `static` are static."""
         self._function = function
         self._static = static
         self._signature = inspect.signature(function)
-        self._plain = jax.jit(function, static_argnames=static)
-        self._programs: dict[_Key, Callable | None] = {}
+        self._plain: jax.stages.Wrapped = jax.jit(function, static_argnames=static)
+        self._programs: dict[_Key, jax.stages.Wrapped | None] = {}
         update_wrapper(self, function)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -121,11 +129,11 @@ class CachedJit:
         program, args, kwargs = self._find(args, kwargs)
         return program.trace(*args, **kwargs)
 
-    def _find(self, args: tuple, kwargs: dict) -> tuple[Callable, tuple, dict]:
+    def _find(self, args: tuple, kwargs: dict) -> tuple[jax.stages.Wrapped, tuple, dict]:
         """Program for such arguments, jitted by JAX, and the arguments to call it with."""
         fallback = self._plain, args, kwargs
-        folder = jax.config.jax_compilation_cache_dir
-        if not _enabled or folder is None or jax.config.jax_disable_jit:
+        folder = setting("jax_compilation_cache_dir")
+        if not _enabled or folder is None or setting("jax_disable_jit"):
             return fallback
         arguments = self._signature.bind(*args, **kwargs).arguments
         static = {name: arguments.pop(name) for name in self._static if name in arguments}
@@ -133,17 +141,17 @@ class CachedJit:
         device = _common_device(leaves)
         if device is None:
             return fallback
-        settings = device.platform, *(getattr(jax.config, name) for name in SETTINGS)
+        settings = device.platform, *(setting(name) for name in SETTINGS)
         key = _Key(folder, settings, tuple(static.items()), treedef, tuple(map(_aval, leaves)))
         if key not in self._programs:
             self._programs[key] = self._load_or_trace(key)
         program = self._programs[key]
         if program is None:
             return fallback
-        committed = treedef.unflatten(_commit(leaf, device) for leaf in leaves)
+        committed = jax.tree.unflatten(treedef, [_commit(leaf, device) for leaf in leaves])
         return program, (committed,), {}
 
-    def _load_or_trace(self, key: _Key) -> Callable | None:
+    def _load_or_trace(self, key: _Key) -> jax.stages.Wrapped | None:
         """Program of a key, from its file or newly traced; None if the key has no stable text."""
         static_text = _stable_text((self._function, key.static))
         if static_text is None or key.settings[0] != jax.default_backend():  # what export targets
@@ -172,7 +180,7 @@ class CachedJit:
         def of_arrays(arrays: dict[str, Any]) -> Any:
             return self._function(**static, **arrays)
 
-        return export.export(jax.jit(of_arrays))(key.treedef.unflatten(key.avals))
+        return export.export(jax.jit(of_arrays))(jax.tree.unflatten(key.treedef, key.avals))
 
 
 def jit(function: Callable, *, static_argnames: str | tuple[str, ...] = ()) -> CachedJit:
@@ -194,7 +202,7 @@ def jit(function: Callable, *, static_argnames: str | tuple[str, ...] = ()) -> C
 def _common_device(leaves: list[Any]) -> jax.Device | None:
     """Device of the arguments; None where some are being traced, or they are on several."""
     arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
-    if jax.config.jax_default_device or any(isinstance(x, jax.core.Tracer) for x in arrays):
+    if setting("jax_default_device") or any(isinstance(x, jax.core.Tracer) for x in arrays):
         return None
     devices = {device for x in arrays for device in x.devices()} or {jax.local_devices()[0]}
     return devices.pop() if len(devices) == 1 else None
@@ -236,9 +244,8 @@ def _stable_text(static: Any) -> str | None:
 def version() -> str:
     """Digest (SHA-256, hexadecimal) of this package's sources and of the versions of JAX."""
     digest = hashlib.sha256(f"{jax.__version__} {jax.lib.__version__}".encode())
-    home = Path(__file__).parent
-    for path in sorted(home.rglob("*.py")):
-        digest.update(str(path.relative_to(home)).encode() + path.read_bytes())
+    for path in sorted(HOME.rglob("*.py")):
+        digest.update(str(path.relative_to(HOME)).encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -252,7 +259,7 @@ def _register_records() -> None:
         for module_name, module in list(sys.modules.items()):
             if module_name.split(".")[0] != PACKAGE:
                 continue
-            for record in vars(module).values():
+            for record in list(vars(module).values()):
                 is_record = isinstance(record, type) and hasattr(record, "_fields")
                 if is_record and record not in _registered:
                     name = f"{record.__module__}.{record.__qualname__}"

@@ -13,8 +13,8 @@ Frames, as in ROS REP 105:
     map: the estimate of the filter or of the smoother; corrected, so it may jump.
     world: the ground truth, of a simulation or of a reference log.
 
-A pose (3,) is x [m], y [m], heading [rad] of the robot frame in odom, map or world. A motion, or
-odometry increment, (3,) is a pose in the frame of the pose before it.
+A pose (3,) is x [m], y [m], heading [rad] of the robot frame in odom, map or world. An increment
+(3,), or odometry increment, is a pose in the frame of the pose before it.
 
 Grids: cell [i, j] covers a square of the robot frame; i grows with x, j with y.
 """
@@ -27,6 +27,9 @@ import numpy as np
 
 Array = jax.Array
 """Any array; its shape, unit and frame are in the docstring of what uses it."""
+
+AnyArray = jax.Array | np.ndarray
+"""An array of JAX or of NumPy, where both are taken as they are."""
 
 Key = jax.Array
 """A key made by `jax.random.key`."""
@@ -47,9 +50,10 @@ def check_array(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> 
     Raises:
         ValueError: Shape or dtype differ; the message states both.
     """
-    sizes, dtype = np.shape(x), jnp.result_type(x)
+    sizes, dtype = np.shape(x), x.dtype if hasattr(x, "dtype") else jnp.result_type(x)
     wanted_sizes = shape[1:] if shape[:1] == (...,) else shape
-    trailing = sizes if wanted_sizes is shape else sizes[-len(wanted_sizes) :]
+    num_leading = 0 if wanted_sizes is shape else max(0, len(sizes) - len(wanted_sizes))
+    trailing = sizes[num_leading:]
     fits = len(trailing) == len(wanted_sizes) and all(
         isinstance(wanted, str) or size == wanted
         for size, wanted in zip(trailing, wanted_sizes, strict=True)
@@ -59,6 +63,65 @@ def check_array(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> 
         listed += "," if len(shape) == 1 else ""
         prefix = "" if kind is None else _dtype_name(kind) + " "
         raise ValueError(f"{name} is {dtype} {sizes}, not {prefix}({listed})")
+
+
+def as_float(name: str, x: Any, shape: tuple[Any, ...]) -> Array:
+    """A JAX array of floats made of a NumPy array, a list or a JAX array of numbers, checked.
+
+    Args:
+        name: Name of `x`, for the message.
+        x: Numbers; what is not a JAX array of floats becomes one of JAX's default precision.
+        shape: As of `check_array`.
+
+    Raises:
+        ValueError: It holds no numbers or has another shape; the message states both.
+    """
+    x = _as_numbers(name, x)
+    if not (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)):
+        x = jnp.asarray(x, float)
+    check_array(name, x, shape, jnp.floating)
+    return x
+
+
+def as_float64(name: str, x: Any, shape: tuple[Any, ...]) -> np.ndarray:
+    """As `as_float`, but a NumPy array in float64, for what is computed on the host."""
+    x = np.asarray(_as_numbers(name, x), np.float64)
+    check_array(name, x, shape)
+    return x
+
+
+def as_bool(name: str, x: Any, shape: tuple[Any, ...]) -> Array:
+    """A JAX array of bools made of a NumPy array, a list or a JAX array of bools, checked.
+
+    Args:
+        name: Name of `x`, for the message.
+        x: Bools; numbers are refused.
+        shape: As of `check_array`.
+
+    Raises:
+        ValueError: It holds no bools or has another shape; the message states both.
+    """
+    x = as_array(name, x)
+    check_array(name, x, shape, jnp.bool_)
+    return jnp.asarray(x)
+
+
+def as_array(name: str, x: Any) -> AnyArray:
+    """An array made of anything array-like; raise ValueError, naming it, if it is none."""
+    if isinstance(x, jax.Array):
+        return x
+    try:
+        return np.asarray(x)
+    except ValueError:
+        raise ValueError(f"{name} is not an array: its parts differ in shape") from None
+
+
+def _as_numbers(name: str, x: Any) -> AnyArray:
+    """An array of floats or integers; raise ValueError if it is none."""
+    x = as_array(name, x)
+    if not (jnp.issubdtype(x.dtype, jnp.floating) or jnp.issubdtype(x.dtype, jnp.integer)):
+        raise ValueError(f"{name} is {x.dtype} {x.shape}, not numbers")
+    return x
 
 
 def _dtype_name(kind: Any) -> str:

@@ -1,1 +1,17 @@
-"""TODO."""
+"""Errors: ATE, RPE and relations of trajectories, NEES of beliefs, summaries of trials and maps."""
+
+from jaxslam.evaluation.consistency import chi_square_bounds as chi_square_bounds
+from jaxslam.evaluation.consistency import nees as nees
+from jaxslam.evaluation.consistency import nees_per_dof as nees_per_dof
+from jaxslam.evaluation.consistency import pose_error as pose_error
+from jaxslam.evaluation.consistency import rmse as rmse
+from jaxslam.evaluation.log_errors import Trajectory as Trajectory
+from jaxslam.evaluation.log_errors import errors_against as errors_against
+from jaxslam.evaluation.log_errors import mean_ate as mean_ate
+from jaxslam.evaluation.log_errors import mean_nees_per_dof as mean_nees_per_dof
+from jaxslam.evaluation.summary import Metrics as Metrics
+from jaxslam.evaluation.summary import evaluate as evaluate
+from jaxslam.evaluation.trajectory import align_trajectory as align_trajectory
+from jaxslam.evaluation.trajectory import ate as ate
+from jaxslam.evaluation.trajectory import relation_errors as relation_errors
+from jaxslam.evaluation.trajectory import rpe as rpe

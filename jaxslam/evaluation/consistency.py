@@ -1,24 +1,38 @@
 """Pose errors, NEES and its chi-square bounds."""
 
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from jaxslam.core.se2 import wrap_angle
-from jaxslam.core.types import Array
+from jaxslam.core.types import AnyArray, Array, as_float
+
+# Trace of the covariance below which a pose is known exactly, as the first of a drive is.
+CERTAIN_TRACE = 1e-12
 
 
-def pose_error(estimate: Array, truth: Array) -> Array:
-    """Error (..., 3) [m, m, rad] of poses (..., 3), in the world frame, heading wrapped."""
+def pose_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
+    """Error (..., 3) [m, m, rad] of poses, in the world frame, heading wrapped to [-pi, pi).
+
+    Args:
+        estimate: (..., 3) [m, m, rad].
+        truth: (..., 3) [m, m, rad], of the same shape.
+
+    Raises:
+        ValueError: One of them holds no poses, or their shapes differ.
+    """
+    estimate = as_float("estimate", estimate, (..., 3))
+    truth = as_float("truth", truth, estimate.shape)
     error = estimate - truth
     return error.at[..., 2].set(wrap_angle(error[..., 2]))
 
 
-def nees(error: Array, cov: Array) -> Array:
+def nees(error: ArrayLike, cov: ArrayLike) -> Array:
     """Normalised estimation error squared, e^T P^-1 e.
 
-    Over many trials of a consistent filter it is chi-square distributed with k degrees of freedom;
-    it is not divided by k. It is computed by elimination: with P = L D L^T, L unit lower
-    triangular, and y = L^-1 e,
+    Over many trials of a consistent filter it is chi-square distributed with k degrees of freedom,
+    with mean k: 3 for a pose. `nees_per_dof` divides it by k. It is computed by elimination: with
+    P = L D L^T, L unit lower triangular, and y = L^-1 e,
 
         e^T P^-1 e = y^T D^-1 y = sum_j y_j^2 / d_j
 
@@ -36,10 +50,15 @@ def nees(error: Array, cov: Array) -> Array:
         (...), inf where P is not positive definite or anything is NaN or infinite; gradients are
         0 there.
 
+    Raises:
+        ValueError: One of them holds no numbers, or their shapes do not fit; while tracing.
+
     References:
         Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications, section 5.4.
     """
+    error = as_float("error", error, (..., "k"))
     size = error.shape[-1]
+    cov = as_float("cov", cov, (*error.shape, size))
     good = jnp.isfinite(error).all(axis=-1) & jnp.isfinite(cov).all(axis=(-2, -1))
     rest = [jnp.where(good, error[..., i], 0.0) for i in range(size)]  # y
     lower = [
@@ -57,6 +76,17 @@ def nees(error: Array, cov: Array) -> Array:
             for m in range(j + 1, i + 1):
                 lower[i][m] = lower[i][m] - factor * lower[m][j]
     return jnp.where(good, total, jnp.inf)
+
+
+def nees_per_dof(values: AnyArray | float, dof: int = 3) -> AnyArray | float:
+    """NEES per degree of freedom: 1 for a consistent filter, above if it is over-confident.
+
+    Args:
+        values: (...) NEES as of `nees`, their mean, or bounds as of `chi_square_bounds`. Of a mean
+            over trials, the result is called ANEES.
+        dof: Degrees of freedom: 3 for a pose.
+    """
+    return values / dof
 
 
 def rmse(values: Array, mask: Array) -> Array:
@@ -82,12 +112,15 @@ def chi_square_bounds(dof: int, count: int, probability: float = 0.95) -> tuple[
 
     Returns:
         Lower and upper bound of the mean, on either side of `dof`.
+
+    Raises:
+        ValueError: An argument is out of its range.
     """
+    for name, number in (("dof", dof), ("count", count)):
+        if number < 1:
+            raise ValueError(f"{name} is {number}, not a number >= 1")
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"probability is {probability}, not between 0 and 1")
     tail = (1.0 - probability) / 2.0
     lower, upper = (float(chdtri(dof * count, above)) / count for above in (1.0 - tail, tail))
     return lower, upper
-
-
-CERTAIN_TRACE = (
-    1e-12  # trace of the covariance below which a pose is known exactly, as the first is
-)

@@ -1,7 +1,5 @@
 """Errors of the estimated poses of a log, with the keys of `metrics.json`."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,10 +7,8 @@ from jaxslam.core import time_series
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.se2_np import relative
 from jaxslam.evaluation import consistency, trajectory
+from jaxslam.evaluation.summary import Metrics as Metrics
 from jaxslam.pipeline.episodes import TrialResult
-
-Metrics = dict[str, Any]
-"""Content of `metrics.json`."""
 
 Trajectory = tuple[np.ndarray, np.ndarray]
 """Times (N,) [s] and poses (N, 3) [m, m, rad]."""
@@ -28,20 +24,20 @@ def path_length(poses: np.ndarray) -> float:
     return float(np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
-def mean_ate(tracks: TrialResult) -> float | None:
+def mean_ate(results: TrialResult) -> float | None:
     """ATE RMSE [m] over Monte-Carlo trials, each aligned on its own; None if none is finite."""
-    stamps = np.arange(tracks.truth.shape[1])
+    stamps = np.arange(results.truth.shape[1])
     squares = [
         trajectory.ate(stamps, estimate, stamps, truth)["ate_rmse_m"] ** 2
-        for estimate, truth in zip(tracks.estimate, tracks.truth, strict=True)
+        for estimate, truth in zip(results.estimate, results.truth, strict=True)
         if np.isfinite(estimate).all()
     ]
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
-def against_reference(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> Metrics:
+def against_reference(times: np.ndarray, poses: np.ndarray, reference: Trajectory) -> Metrics:
     """ATE, RPE and heading RMSE of poses (T, 3), after rigid alignment with a reference."""
-    ref_times, ref_poses = known
+    ref_times, ref_poses = reference
     ate = trajectory.ate(times, poses, ref_times, ref_poses)
     rpe = trajectory.rpe(times, poses, ref_times, ref_poses)
     i, j = time_series.match_times(times, ref_times).T
@@ -57,42 +53,42 @@ def mean_nees_per_dof(error: np.ndarray, cov: np.ndarray) -> float | None:
         error: (T, 3) [m, m, rad]; rows that are not finite are left out.
         cov: (T, 3, 3); a pose without uncertainty, such as the first, is left out.
     """
-    use = np.isfinite(error).all(axis=1) & (
-        np.trace(cov, axis1=1, axis2=2) > consistency.CERTAIN_TRACE
-    )
-    nees = np.asarray(
-        consistency.nees(jnp.asarray(error[use], float), jnp.asarray(cov[use], float))
-    )
-    nees = nees[np.isfinite(nees)]
-    return float(nees.mean()) / 3.0 if nees.size else None
+    uncertain = np.trace(cov, axis1=1, axis2=2) > consistency.CERTAIN_TRACE
+    used = np.isfinite(error).all(axis=1) & uncertain
+    values = consistency.nees(jnp.asarray(error[used], float), jnp.asarray(cov[used], float))
+    finite = np.asarray(values)[np.isfinite(values)]
+    return float(consistency.nees_per_dof(float(finite.mean()))) if finite.size else None
 
 
-def against_relations(recording: LaserLog, poses: np.ndarray, verified: Relations) -> Metrics:
+def against_relations(laser_log: LaserLog, poses: np.ndarray, relations: Relations) -> Metrics:
     """Relation errors of poses (T, 3): deviations from verified relative poses."""
     errors = trajectory.relation_errors(
-        recording.times, poses, recording.odom_stream_times, recording.odom_stream_poses, verified
+        laser_log.times, poses, laser_log.odom_stream_times, laser_log.odom_stream_poses, relations
     )
     return {"relations": errors}
 
 
 def errors_against(
-    recording: LaserLog, poses: np.ndarray, known: Trajectory | None, verified: Relations | None
+    laser_log: LaserLog,
+    poses: np.ndarray,
+    reference: Trajectory | None,
+    relations: Relations | None,
 ) -> Metrics:
     """Evaluate poses (T, 3) with the reference and with the relations, where given."""
-    numbers = {} if known is None else against_reference(recording.times, poses, known)
-    return numbers | ({} if verified is None else against_relations(recording, poses, verified))
+    numbers = {} if reference is None else against_reference(laser_log.times, poses, reference)
+    return numbers | ({} if relations is None else against_relations(laser_log, poses, relations))
 
 
-def reference_in_map(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> np.ndarray:
+def reference_in_map(times: np.ndarray, poses: np.ndarray, reference: Trajectory) -> np.ndarray:
     """Reference poses (K, 3) in the map frame, after rigid alignment with poses (T, 3)."""
-    ref_times, ref_poses = known
+    ref_times, ref_poses = reference
     i, j = time_series.match_times(times, ref_times).T
     return relative(trajectory.align_trajectory(poses[i, :2], ref_poses[j, :2]), ref_poses[j])
 
 
-def errors_since_start(times: np.ndarray, poses: np.ndarray, known: Trajectory) -> np.ndarray:
+def errors_since_start(times: np.ndarray, poses: np.ndarray, reference: Trajectory) -> np.ndarray:
     """Errors (T, 3) of poses after alignment at the first matched pose; NaN without reference."""
-    ref_times, ref_poses = known
+    ref_times, ref_poses = reference
     i, j = time_series.match_times(times, ref_times).T
     origin = np.zeros(3)
     frame = relative(relative(ref_poses[j[0]], origin), relative(poses[i[0]], origin))

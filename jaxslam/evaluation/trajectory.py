@@ -1,12 +1,14 @@
 """Errors of trajectories against references: ATE, RPE, relations; NumPy, float64."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxslam.core.se2_np import compose, relative
 from jaxslam.core.time_series import interpolate_poses, match_times, sort_by_time
+from jaxslam.core.types import as_float64
 
 
-def align_trajectory(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def align_trajectory(estimate: ArrayLike, reference: ArrayLike) -> np.ndarray:
     """Rigid transform (3,) [m, m, rad] that best aligns one set of points with another.
 
     With a_i, b_i the points of the estimate and the reference, each relative to its mean, the
@@ -27,9 +29,10 @@ def align_trajectory(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
     References:
         Umeyama (1991), Least-squares estimation of transformation parameters, without the scale.
     """
-    estimate, reference = np.asarray(estimate, np.float64), np.asarray(reference, np.float64)
-    if estimate.shape != reference.shape or estimate.ndim != 2 or estimate.size == 0:
-        raise ValueError(f"points {estimate.shape} and {reference.shape} are not both (N >= 1, 2)")
+    estimate = as_float64("estimate", estimate, ("N", 2))
+    reference = as_float64("reference", reference, estimate.shape)
+    if not estimate.size:
+        raise ValueError("estimate is empty: (0, 2)")
     estimate_mean, reference_mean = estimate.mean(axis=0), reference.mean(axis=0)
     a, b = estimate - estimate_mean, reference - reference_mean
     angle = np.arctan2(
@@ -40,10 +43,10 @@ def align_trajectory(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def ate(
-    times: np.ndarray,
-    poses: np.ndarray,
-    ref_times: np.ndarray,
-    ref_poses: np.ndarray,
+    times: ArrayLike,
+    poses: ArrayLike,
+    ref_times: ArrayLike,
+    ref_poses: ArrayLike,
     tolerance: float = 0.05,
 ) -> dict[str, float | int]:
     """Absolute trajectory error (ATE) of positions, after rigid alignment.
@@ -59,26 +62,27 @@ def ate(
         `ate_rmse_m`, and `matched`: number of poses that were compared.
 
     Raises:
-        ValueError: Fewer than two times can be associated.
+        ValueError: Fewer than two times can be associated, or an argument does not fit.
 
     References:
         Sturm et al. (2012), A benchmark for the evaluation of RGB-D SLAM systems, section IV.
     """
+    times, poses, ref_times, ref_poses = _checked(times, poses, ref_times, ref_poses, tolerance)
     pairs = match_times(times, ref_times, tolerance)
     if len(pairs) < 2:
-        raise ValueError(f"{len(pairs)} times agree within {tolerance} s; are the clocks the same?")
-    estimate = np.asarray(poses, np.float64)[pairs[:, 0]]
-    reference = np.asarray(ref_poses, np.float64)[pairs[:, 1], :2]
+        found = f"{len(pairs)} times agree with ref_times within {tolerance} s"
+        raise ValueError(f"{found}; are the clocks the same?")
+    estimate, reference = poses[pairs[:, 0]], ref_poses[pairs[:, 1], :2]
     aligned = compose(align_trajectory(estimate[:, :2], reference), estimate)
     distance = np.linalg.norm(aligned[:, :2] - reference, axis=1)
     return {"ate_rmse_m": float(np.sqrt(np.mean(distance**2))), "matched": len(pairs)}
 
 
 def rpe(
-    times: np.ndarray,
-    poses: np.ndarray,
-    ref_times: np.ndarray,
-    ref_poses: np.ndarray,
+    times: ArrayLike,
+    poses: ArrayLike,
+    ref_times: ArrayLike,
+    ref_poses: ArrayLike,
     tolerance: float = 0.05,
     delta: float = 1.0,
 ) -> dict[str, float | None]:
@@ -100,16 +104,16 @@ def rpe(
         `rpe_translation_rmse_m` and `rpe_rotation_rmse_deg`; None if the trajectory is shorter.
 
     Raises:
-        ValueError: `delta` is not positive.
+        ValueError: `delta` is not positive, or an argument does not fit.
 
     References:
         Sturm et al. (2012), A benchmark for the evaluation of RGB-D SLAM systems, section IV.
     """
+    times, poses, ref_times, ref_poses = _checked(times, poses, ref_times, ref_poses, tolerance)
     if not delta > 0.0:
-        raise ValueError(f"motions {delta} m apart")
+        raise ValueError(f"delta is {delta}, not a positive number of metres")
     i, j = match_times(times, ref_times, tolerance).T
-    estimate = np.asarray(poses, np.float64)[i]
-    reference = np.asarray(ref_poses, np.float64)[j]
+    estimate, reference = poses[i], ref_poses[j]
     ends, length = [0], 0.0
     for k, distance in enumerate(np.hypot(*np.diff(reference[:, :2], axis=0).T), start=1):
         length += distance
@@ -127,11 +131,11 @@ def rpe(
 
 
 def relation_errors(
-    times: np.ndarray,
-    poses: np.ndarray,
-    odom_times: np.ndarray,
-    odom_poses: np.ndarray,
-    relations: tuple[np.ndarray, np.ndarray, np.ndarray],
+    times: ArrayLike,
+    poses: ArrayLike,
+    odom_times: ArrayLike,
+    odom_poses: ArrayLike,
+    relations: tuple[ArrayLike, ArrayLike, ArrayLike],
 ) -> dict[str, float | int]:
     """Relation error: relative poses of a trajectory beside verified ones.
 
@@ -149,12 +153,14 @@ def relation_errors(
         absolute errors, and `used`: number of relations within the time span of the estimate.
 
     Raises:
-        ValueError: No relation is within that time span.
+        ValueError: No relation is within that time span, or an argument does not fit.
 
     References:
         Kuemmerle et al. (2009), On measuring the accuracy of SLAM algorithms.
     """
-    t1, t2, verified = (np.asarray(column, np.float64) for column in relations)
+    times, poses = _checked_trajectory("", times, poses)
+    odom_times, odom_poses = _checked_trajectory("odom_", odom_times, odom_poses)
+    t1, t2, verified = _checked_relations(relations)
     slack = 1e-5  # [s] for the rounding of written times
     first = np.min(times) - slack
     last = max(np.max(times), np.max(odom_times)) + slack
@@ -179,14 +185,51 @@ def _pose_at(
     slack: float,
     times: np.ndarray,
     poses: np.ndarray,
-    odometry_times: np.ndarray,
-    odometry_poses: np.ndarray,
+    odom_times: np.ndarray,
+    odom_poses: np.ndarray,
 ) -> np.ndarray:
     """Poses (K, 3) at times (K,) [s]: the last estimate before each, extended by odometry."""
     times, poses = sort_by_time(times, poses)
     last = np.searchsorted(times, wanted + slack, side="right") - 1
-    odometry = sort_by_time(odometry_times, odometry_poses)
+    odometry = sort_by_time(odom_times, odom_poses)
     increment = relative(
         interpolate_poses(times[last], *odometry), interpolate_poses(wanted, *odometry)
     )
     return compose(poses[last], increment)
+
+
+def _checked(
+    times: ArrayLike,
+    poses: ArrayLike,
+    ref_times: ArrayLike,
+    ref_poses: ArrayLike,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Two trajectories in float64; ValueError if they are none, or if the tolerance is none."""
+    if not tolerance >= 0.0:
+        raise ValueError(f"tolerance is {tolerance}, not a number of seconds >= 0")
+    estimate = _checked_trajectory("", times, poses)
+    return *estimate, *_checked_trajectory("ref_", ref_times, ref_poses)
+
+
+def _checked_trajectory(
+    prefix: str, times: ArrayLike, poses: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) and poses (N, 3) in float64, called `prefix` times and poses in messages."""
+    times = as_float64(f"{prefix}times", times, ("N",))
+    if not times.size:
+        raise ValueError(f"{prefix}times is empty")
+    return times, as_float64(f"{prefix}poses", poses, (len(times), 3))
+
+
+def _checked_relations(
+    relations: tuple[ArrayLike, ArrayLike, ArrayLike],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Relations in float64; ValueError if they are not three arrays that fit, or none."""
+    if not isinstance(relations, tuple | list) or len(relations) != 3:
+        raise ValueError("relations is not a tuple of t1, t2 and relative poses")
+    t1 = as_float64("relations t1", relations[0], ("K",))
+    if not t1.size:
+        raise ValueError("relations is empty")
+    t2 = as_float64("relations t2", relations[1], (len(t1),))
+    return t1, t2, as_float64("relations relative_pose", relations[2], (len(t1), 3))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.core.features import Features
-from jaxslam.core.types import JUNCTION, Array, check_array, check_covariance
+from jaxslam.core.types import CORNER, JUNCTION, Array, as_float, check_covariance
 from jaxslam.filtering.covariance import DeferredCovariance, flush
 
 
@@ -16,12 +16,12 @@ class Belief(NamedTuple):
     The covariance is kept in blocks: a prediction changes the first two only.
 
     A landmark's two numbers in its slot are its position [m] (junction, corner), or the direction
-    of a wall [rad] and 0; world frame.
+    of a wall [rad] and 0; map frame.
 
     Attributes:
         mean: (D,) pose [m, m, rad], then the slots.
-        first_estimate: (D,) pose as last predicted, slots as first estimated: where "first_estimates"
-            linearises.
+        first_estimate: (D,) pose as last predicted, slots as first estimated: where the
+            linearisation "first_estimates" takes the Jacobians.
         pose_cov: (3, 3) covariance of the pose.
         cross_cov: (3, 2 L) covariance of pose and slots.
         map_cov: (2 L, 2 L) covariance of the slots; dense or deferred.
@@ -29,11 +29,11 @@ class Belief(NamedTuple):
         last_seen: (L,) int32 step of its last observation.
         num_missed: (L,) int32 consecutive missed detections: steps at which it should have been
             observed and was not.
-        num_pending: (L,) int32 consecutive matches that are not accepted yet, while matches of
-            landmarks are verified.
+        num_pending: (L,) int32 consecutive scans with a match that was not accepted yet, while
+            matches are verified.
         kind: (L,) int32 `JUNCTION`, `CORNER` or `WALL`.
         id: (L,) int32 ID of the landmark, never reused.
-        direction: (L,) [rad] world frame, bisector of the free side of a corner.
+        direction: (L,) [rad] map frame, bisector of the free side of a corner.
         descriptor: (L,) descriptor: clearance [m] of a junction, angle of the free side [rad] of a
             corner.
         step: () int32 number of the step.
@@ -58,7 +58,7 @@ class Belief(NamedTuple):
 
     @property
     def pose(self) -> Array:
-        """Mean pose (3,) [m, m, rad], world frame."""
+        """Mean pose (3,) [m, m, rad], map frame."""
         return self.mean[..., :3]
 
     @property
@@ -71,7 +71,7 @@ class Belief(NamedTuple):
 
     @property
     def landmark_positions(self) -> Array:
-        """Slots (L, 2) of the mean: position [m], or direction of a wall [rad] and 0; world."""
+        """Slots (L, 2) of the mean: position [m], or direction of a wall [rad] and 0; map."""
         return self.mean[..., 3:].reshape(self.mean.shape[:-1] + (-1, 2))
 
 
@@ -79,18 +79,21 @@ def initial_belief(pose: Array, *, max_landmarks: int, cov: Array | None = None)
     """Belief with an initial pose and an empty map.
 
     Args:
-        pose: (3,) [m, m, rad] world frame.
+        pose: (3,) [m, m, rad] map frame; its precision is that of the belief.
         max_landmarks: L, slots of the map.
         cov: (3, 3) covariance of the pose; zero by default: the first pose defines the map frame.
 
     Raises:
-        ValueError: The covariance is not symmetric and positive semi-definite.
+        ValueError: `pose` or `cov` has another shape or holds no numbers, `cov` is not symmetric
+            and positive semi-definite, or `max_landmarks` is below 1.
     """
-    size = 3 + 2 * max_landmarks
-    dtype = jnp.result_type(pose)
+    if max_landmarks < 1:
+        raise ValueError(f"max_landmarks is {max_landmarks}, not 1 or more")
+    pose = as_float("pose", pose, (3,))
     if cov is not None:
-        check_array("cov", cov, (3, 3), jnp.floating)
+        cov = as_float("cov", cov, (3, 3))
         check_covariance("cov", cov, definite=False)
+    size, dtype = 3 + 2 * max_landmarks, pose.dtype
     zeros = jnp.zeros(max_landmarks, jnp.int32)
     mean = jnp.zeros(size, dtype).at[:3].set(pose)
     return Belief(
@@ -115,8 +118,13 @@ def initial_belief(pose: Array, *, max_landmarks: int, cov: Array | None = None)
 def grow_belief(belief: Belief, max_landmarks: int) -> Belief:
     """The belief with more slots, `max_landmarks` in all; the added ones are free.
 
-    Its covariance must be dense.
+    Raises:
+        ValueError: It has more slots already, or its covariance is deferred, not dense.
     """
+    _dense_map_cov(belief)
+    if max_landmarks < belief.num_seen.size:
+        size = belief.num_seen.size
+        raise ValueError(f"max_landmarks is {max_landmarks}, less than the {size} slots there are")
     blank = initial_belief(belief.pose, max_landmarks=max_landmarks)
 
     def put_at_start(old: Array, new: Array) -> Array:
@@ -132,31 +140,45 @@ def add_known_landmarks(
 
     Args:
         belief: Without landmarks; its covariance must be dense.
-        positions: (K, 2) mean positions [m], world frame; K <= L.
+        positions: (K, 2) mean positions [m], map frame; K <= L.
         cov: (K, 2, 2) covariances [m^2] of the positions, which are independent.
         kind: Kind of all of them, `JUNCTION` or `CORNER`.
 
     Raises:
-        ValueError: A covariance is not symmetric and positive definite, or shapes do not fit.
+        ValueError: A covariance is not symmetric and positive definite, a shape does not fit, the
+            map has no capacity for all of them or is not empty, or the kind is neither.
     """
-    check_array("places", positions, ("K", 2), jnp.floating)
-    count, size = positions.shape[0], belief.num_seen.size
-    check_array("cov", cov, (count, 2, 2), jnp.floating)
+    dtype = belief.mean.dtype
+    positions = as_float("positions", positions, ("K", 2)).astype(dtype)
+    count, size = len(positions), belief.num_seen.size
+    cov = as_float("cov", cov, (count, 2, 2)).astype(dtype)
     check_covariance("cov", cov)
+    if kind not in (JUNCTION, CORNER):
+        raise ValueError(f"kind is {kind!r}, not {JUNCTION} (JUNCTION) or {CORNER} (CORNER)")
     if count > size:
-        raise ValueError(f"{count} positions for a map of {size} landmarks")
+        raise ValueError(f"positions holds {count} landmarks, and the belief has {size} slots")
+    if not isinstance(belief.num_seen, jax.core.Tracer) and belief.num_seen.any():
+        raise ValueError("belief has landmarks already, and known ones go to an empty map")
     index = jnp.arange(count, dtype=jnp.int32)
     mean = belief.mean.at[3 : 3 + 2 * count].set(positions.reshape(-1))
-    map_cov = belief.map_cov.reshape(size, 2, size, 2).at[index, :, index].set(cov)
+    map_cov = _dense_map_cov(belief)
+    blocks = map_cov.reshape(size, 2, size, 2).at[index, :, index].set(cov)
     return belief._replace(
         mean=mean,
         first_estimate=mean,
-        map_cov=map_cov.reshape(belief.map_cov.shape),
+        map_cov=blocks.reshape(map_cov.shape),
         num_seen=belief.num_seen.at[:count].set(1),
         kind=belief.kind.at[:count].set(kind),
         id=belief.id.at[:count].set(index),
         next_id=jnp.maximum(belief.next_id, jnp.int32(count)),
     )
+
+
+def _dense_map_cov(belief: Belief) -> Array:
+    """The covariance (2 L, 2 L) of the slots; ValueError if it is deferred."""
+    if isinstance(belief.map_cov, DeferredCovariance):
+        raise ValueError("belief.map_cov is deferred: flush it first")
+    return belief.map_cov
 
 
 def record_observations(belief: Belief, features: Features, slot: Array) -> Belief:
@@ -179,10 +201,10 @@ def eviction_cost(belief: Belief, confirmed: Array, *, evict_after: int) -> Arra
     """Eviction cost of each slot (L,): the slot of least cost is reused first.
 
     It is zero for free slots, and infinite for confirmed landmarks and those observed within the
-    last `evict_after` steps. For the other candidates it orders by the number of observations, then by
-    the step of the last one:
+    last `evict_after` steps. The other candidates are ordered by the number of observations, then
+    by the step of the last one:
 
-        cost = seen + 1 - age / (1 + max(step, age)),      age = step - last
+        cost = num_seen + 1 - age / (1 + max(step, age)),      age = step - last_seen
 
     Args:
         belief: Belief.

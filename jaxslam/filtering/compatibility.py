@@ -1,6 +1,6 @@
-"""Data association: gated nearest neighbour, joint compatibility, slots and numbers of landmarks.
+"""Mutual nearest neighbours in a gate, and the joint compatibility test of a scan's matches.
 
-All of it works on distances, covariances and ids; nothing depends on the filter.
+Both work on distances and covariances alone; nothing depends on the filter.
 """
 
 from typing import NamedTuple

@@ -1,13 +1,38 @@
 """Static configuration of the filter, and what follows from it: initial belief, confirmation."""
 
 import math
-from typing import NamedTuple
+from functools import lru_cache
+from numbers import Integral, Real
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from jaxslam.core.types import CORNER, JUNCTION, WALL, Array
 from jaxslam.filtering.belief import Belief, initial_belief
 from jaxslam.filtering.data_association import AssociationSpec
+from jaxslam.filtering.ekf import check_linearisation
+
+KIND_NAMES = {JUNCTION: "JUNCTION", CORNER: "CORNER", WALL: "WALL"}
+FULL_TURN = 2 * math.pi + 0.1  # [rad] widest field of view, with an allowance for rounding
+# Least whole numbers of the configuration.
+LEAST = {
+    "max_landmarks": 1,
+    "max_updates": 1,
+    "max_new": 1,
+    "confirm_count": 1,
+    "wall_confirm_count": 1,
+    "max_unconfirmed_age": 0,
+    "evict_after": 0,
+    "max_misses": 1,
+}
+# Thresholds of data association that may be 0; the others must be larger.
+MAY_BE_ZERO = (
+    "ambiguity_margin",
+    "min_separation",
+    "min_wall_angle",
+    "support_distance",
+    "verify_above_std",
+)
 
 
 class FilterConfig(NamedTuple):
@@ -49,17 +74,79 @@ class FilterConfig(NamedTuple):
     field_of_view: tuple[float, float] = (-math.pi / 2, math.pi / 2)
 
 
+def check_config(config: FilterConfig) -> None:
+    """Check the configuration of the filter; what was checked once costs a look-up.
+
+    Raises:
+        ValueError: It is no `FilterConfig`, or one of its numbers or options is unknown or out of
+            range; the message states which, and what is expected.
+    """
+    if not isinstance(config, FilterConfig):
+        hint = "; pass config.filter" if hasattr(config, "filter") else ""
+        raise ValueError(f"config is {type(config).__name__}, not FilterConfig{hint}")
+    for name, value in config._asdict().items():
+        try:
+            hash(value)
+        except TypeError:
+            kind = type(value).__name__
+            raise ValueError(f"config.{name} is {kind}, not hashable: give a tuple") from None
+    if not isinstance(config.association, AssociationSpec):
+        kind = type(config.association).__name__
+        raise ValueError(f"config.association is {kind}, not AssociationSpec")
+    _check_fields(config, tuple(map(type, config + config.association)))
+
+
+@lru_cache(maxsize=256)
+def _check_fields(config: FilterConfig, _: tuple[type, ...]) -> None:
+    """Check a hashable configuration; by its types the cache keeps 96 and 96.0 apart."""
+    check_linearisation(config.linearisation)
+    kinds = config.landmark_kinds
+    if not isinstance(kinds, tuple) or not kinds or not set(kinds) <= set(KIND_NAMES):
+        known = ", ".join(f"{kind} ({name})" for kind, name in KIND_NAMES.items())
+        raise ValueError(f"config.landmark_kinds is {kinds!r}, not a tuple of {known}")
+    for name, least in LEAST.items():
+        _check_number(name, getattr(config, name), least, whole=True)
+    _check_number("untrusted_inflation", config.untrusted_inflation, 0, above=True)
+    if not math.isfinite(config.untrusted_inflation):
+        raise ValueError(f"config.untrusted_inflation is {config.untrusted_inflation}, not finite")
+    for name, value in config.association._asdict().items():
+        if name == "verify_scans":
+            _check_number(f"association.{name}", value, 1, whole=True)
+        else:
+            _check_number(f"association.{name}", value, 0, above=name not in MAY_BE_ZERO)
+    view = config.field_of_view
+    numbers = isinstance(view, tuple) and len(view) == 2 and all(isinstance(x, Real) for x in view)
+    if not numbers or not 0.0 < view[1] - view[0] <= FULL_TURN:
+        wanted = "(first, last) beam [rad], increasing, one turn at most"
+        raise ValueError(f"config.field_of_view is {view}, not {wanted}")
+
+
+def _check_number(
+    name: str, value: Any, least: int, *, whole: bool = False, above: bool = False
+) -> None:
+    """Raise ValueError unless a number of the configuration is at least, or above, a bound."""
+    kind = Integral if whole else Real
+    is_number = isinstance(value, kind) and not isinstance(value, bool)
+    if not is_number or not (value > least if above else value >= least):  # NaN compares false
+        wanted = (
+            f"a {'whole ' if whole else ''}number {'above' if above else 'of at least'} {least}"
+        )
+        raise ValueError(f"config.{name} is {value!r}, not {wanted}")
+
+
 def init(config: FilterConfig, pose: Array, cov: Array | None = None) -> Belief:
     """Initial belief of a robot with an empty map.
 
     Args:
-        config: FilterConfiguration of the filter.
+        config: Static configuration of the filter.
         pose: (3,) [m, m, rad] first pose, map frame.
         cov: (3, 3) covariance of the pose; zero by default, as the map has no other origin.
 
     Raises:
-        ValueError: The covariance is not symmetric and positive semi-definite.
+        ValueError: The configuration is wrong (`check_config`), `pose` or `cov` has another shape
+            or holds no numbers, or `cov` is not symmetric and positive semi-definite.
     """
+    check_config(config)
     return initial_belief(pose, max_landmarks=config.max_landmarks, cov=cov)
 
 

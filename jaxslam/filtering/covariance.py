@@ -1,9 +1,9 @@
 """Covariance of a map of L landmarks, (2 L, 2 L): dense, or with its downdates deferred.
 
 A Kalman update subtracts y^T y from the map's covariance, with few rows y (k, 2 L). For a large map
-this pass over the whole matrix is what an update costs. It can be postponed: the rows are stored,
+this pass over the whole matrix is what an update costs. It can be deferred: the rows are stored,
 
-    P  =  base - rows^T rows,        base (2 L, 2 L),   rows (<= ROOM, 2 L)
+    P  =  base - rows^T rows,    base (2 L, 2 L),   rows (<= MAX_DEFERRED_ROWS, 2 L)
 
 and an update appends its y to `rows`, which costs O(k L) instead of O(k L^2). What the filter reads
 of P in between is little, and is computed from the two parts when it is read:
@@ -40,13 +40,13 @@ class DeferredCovariance(NamedTuple):
 
     Attributes:
         base: (n, n) covariance before the deferred downdates; n = 2 L.
-        rows: (ROOM, n) deferred rows, in order; unused ones are zero.
+        rows: (MAX_DEFERRED_ROWS, n) deferred rows, in order; unused ones are zero.
         sums: (2, n) running sums over the deferred rows r, for the diagonal blocks of
             rows^T rows: sums[0, j] = sum of r[j]^2, sums[1, j] = sum of r[j] r[j + 1]. Of the
             latter only even j are read, where j and j + 1 are the two numbers of one landmark.
         num_rows: () int32 how many of `rows` are used.
-        num_updates: () how many updates were deferred; each raises the variances by `VARIANCE_GUARD` units of
-            rounding, which the flush applies.
+        num_updates: () how many updates were deferred; each raises the variances by
+            `VARIANCE_GUARD` units of rounding, which the flush applies.
     """
 
     base: Array
@@ -81,7 +81,7 @@ def _subtract_product(base: Array, rows: Array) -> Array:
         base    +---------+  strip 0
                 +---------+  strip 1
                 +---------+  ...             up to the last strip with a nonzero column of `rows`
-                +---------+  remainder       len(base) mod STRIP rows, always
+                +---------+  remainder       len(base) mod STRIP_ROWS rows, always
     """
     columns = rows.T
     num_strips, remainder = divmod(len(base), STRIP_ROWS)
@@ -120,10 +120,9 @@ def slot_rows(cov: Array | DeferredCovariance, slot: Array) -> Array:
     if not isinstance(cov, DeferredCovariance):
         return cov.reshape(-1, 2, cov.shape[-1])[slot]
     base, size = slot_rows(cov.base, slot), len(cov.base)
-    deferred_at_slot = cov.rows.reshape(MAX_DEFERRED_ROWS, -1, 2)[:, slot].reshape(
-        MAX_DEFERRED_ROWS, -1
-    )  # (ROOM, 2 K)
-    return base - (deferred_at_slot.T @ cov.rows).reshape(-1, 2, size)
+    deferred = cov.rows.reshape(MAX_DEFERRED_ROWS, -1, 2)[:, slot]
+    deferred = deferred.reshape(MAX_DEFERRED_ROWS, -1)  # columns of the slots, (.., 2 K)
+    return base - (deferred.T @ cov.rows).reshape(-1, 2, size)
 
 
 def slot_blocks(cov: Array | DeferredCovariance) -> Array:
@@ -147,13 +146,13 @@ def downdate(cov: Array | DeferredCovariance, y: Array, seen: Array) -> Array | 
     Args:
         cov: The covariance. A deferred one must have capacity for the rows that are not zero
             (`flush_if_full`), which is not checked.
-        y: (k, n); rows of zeros count for nothing.
+        y: (k, n); rows of zeros change nothing.
         seen: () bool, whether anything was observed.
     """
     if isinstance(cov, DeferredCovariance):
         return _defer(cov, y, seen)
-    # Rows that count come first. Of a large map they are seldom more than half of all, and the
-    # pass over the matrix for the others is skipped when they are zero.
+    # Rows that are not zero come first. Of a large map they are seldom more than half of all, and
+    # the pass over the matrix for the others is skipped when they are zero.
     half = len(y) // 2 if len(cov) > LARGE_MAP else len(y)
     if half < len(y):
         cov = linalg.downdate_rarely(cov, y[half:], jnp.any(y[half:] != 0.0))
@@ -173,7 +172,7 @@ def _defer(cov: DeferredCovariance, y: Array, seen: Array) -> DeferredCovariance
 
 
 def _raise_variances(cov: Array, seen: Array) -> Array:
-    """The dense covariance with its diagonal times 1 + `VARIANCE_GUARD` units of rounding, if `seen`."""
+    """The dense covariance, its diagonal raised by `VARIANCE_GUARD` units of rounding if `seen`."""
     relative, one = VARIANCE_GUARD * np.finfo(cov.dtype).eps, jnp.ones((), cov.dtype)
     if len(cov) > LARGE_MAP:
         diagonal = jnp.arange(len(cov), dtype=jnp.int32)

@@ -1,4 +1,4 @@
-"""Data association of a scan with the map: matches, their verification, new and missed landmarks.
+"""Data association of a scan with the map: matches with landmarks, and features that are new.
 
 Features and landmarks are compared in pairs, (M, L). The two numbers of a measurement have no axis
 of their own in these arrays: for arrays as small as these, such an axis is slow.
@@ -25,16 +25,17 @@ class AssociationSpec(NamedTuple):
     Attributes:
         gate: Largest squared Mahalanobis distance of a match; the chi-square quantile of two
             degrees of freedom at 99 %.
-        ambiguity_margin: Least difference in squared distance between the nearest landmark and the next; a
-            feature with less is ambiguous and stays unmatched.
+        ambiguity_margin: Least difference in squared distance between the nearest landmark and the
+            next; a feature with less is ambiguous and stays unmatched.
         new_gate: Squared distance to all landmarks of its kind from which a feature may be new.
-        min_separation: [m] distance to all landmarks of its kind from which a feature may be new; two
-            landmarks nearer than this may be duplicates.
+        min_separation: [m] distance to all landmarks of its kind from which a feature may be new;
+            two landmarks nearer than this may be duplicates.
         min_wall_angle: [rad] likewise between wall directions.
         max_log_clearance_ratio: [-] largest logarithm of the ratio of two clearances that match.
-        max_corner_difference: [rad] largest difference between two corners that match, in direction and in angle.
-        verify_above_std: [m] standard deviation of a landmark's position relative to the robot above which its
-            match needs verification.
+        max_corner_difference: [rad] largest difference between two corners that match, in direction
+            and in angle.
+        verify_above_std: [m] standard deviation of a landmark's position relative to the robot
+            above which its match needs verification.
         support_distance: [m] least distance to another match of the scan that can verify it.
         verify_scans: Number of consecutive scans with such a match that verify it instead.
     """
@@ -51,13 +52,27 @@ class AssociationSpec(NamedTuple):
     verify_scans: int = 2
 
 
+class Matches(NamedTuple):
+    """Matches of the features of a scan, as a step narrows them down.
+
+    Attributes:
+        slot: (M,) int32 slot of the matched landmark, L for none.
+        used: (M,) bool, the match updates the state; a match with an unconfirmed landmark does not.
+        order: (K,) int32 feature of each of the K rows of the update.
+    """
+
+    slot: Array
+    used: Array
+    order: Array
+
+
 class Association(NamedTuple):
     """Association of the features of a scan with landmarks.
 
     Attributes:
         slot: (M,) int32 slot of the matched landmark, L for none.
         is_new: (M,) bool, the feature is to become a new landmark.
-        new_slot: (M,) int32 slot that a new landmark must get, L for none; None where any slot will do.
+        new_slot: (M,) int32 slot that a new landmark must get, L for none; None for any slot.
     """
 
     slot: Array
@@ -139,13 +154,19 @@ def resembles(
         features.descriptor[:, None],
         belief.descriptor[None],
         facing,
-        shape=max_log_clearance_ratio,
-        turn=max_corner_difference,
+        max_log_clearance_ratio=max_log_clearance_ratio,
+        max_corner_difference=max_corner_difference,
     )
 
 
 def similar_descriptors(
-    kind: Array, first: Array, second: Array, facing: Array, *, shape: float, turn: float
+    kind: Array,
+    first: Array,
+    second: Array,
+    facing: Array,
+    *,
+    max_log_clearance_ratio: float,
+    max_corner_difference: float,
 ) -> Array:
     """Whether the descriptors of two things of one kind agree; always, for walls.
 
@@ -154,13 +175,15 @@ def similar_descriptors(
         first: Descriptor of the first: clearance [m] of a junction, angle [rad] of a corner.
         second: Descriptor of the second.
         facing: [rad] difference of the directions that they face.
-        shape: [-] largest logarithm of the ratio of clearances.
-        turn: [rad] largest difference of corners, in direction and in angle.
+        max_log_clearance_ratio: [-] largest logarithm of the ratio of clearances.
+        max_corner_difference: [rad] largest difference of corners, in direction and in angle.
     """
     log_ratio = jnp.log(jnp.maximum(first, 1e-3) / jnp.maximum(second, 1e-3))
-    junction = jnp.abs(log_ratio) < shape
-    corner = (jnp.abs(wrap_angle(facing)) < turn) & (jnp.abs(first - second) < turn)
-    return jnp.where(kind == JUNCTION, junction, jnp.where(kind == CORNER, corner, True))
+    is_similar_junction = jnp.abs(log_ratio) < max_log_clearance_ratio
+    is_similar_corner = jnp.abs(wrap_angle(facing)) < max_corner_difference
+    is_similar_corner &= jnp.abs(first - second) < max_corner_difference
+    other = jnp.where(kind == CORNER, is_similar_corner, True)
+    return jnp.where(kind == JUNCTION, is_similar_junction, other)
 
 
 def far_from_landmarks(
@@ -202,8 +225,8 @@ def associate(spec: AssociationSpec, belief: Belief, features: Features, R: Arra
         max_corner_difference=spec.max_corner_difference,
     )
     slot = match_nearest(distance, possible, gate=spec.gate, margin=spec.ambiguity_margin)
-    new = (slot == belief.num_seen.size) & far_from_landmarks(spec, belief, features, distance)
-    return Association(slot, new, None)
+    is_new = (slot == belief.num_seen.size) & far_from_landmarks(spec, belief, features, distance)
+    return Association(slot, is_new, None)
 
 
 def use_known_ids(belief: Belief, features: Features, landmark_ids: Array) -> Association:
@@ -217,7 +240,7 @@ def use_known_ids(belief: Belief, features: Features, landmark_ids: Array) -> As
     Raises:
         ValueError: `landmark_ids` has another shape or type than the features; while tracing.
     """
-    check_array("inputs.known", landmark_ids, features.kind.shape, jnp.int32)
+    check_array("landmark_ids", landmark_ids, features.kind.shape, jnp.int32)
     size = belief.num_seen.size
     has_id = features.valid & (landmark_ids >= 0) & (landmark_ids < size)
     same_id = (landmark_ids[:, None] == landmark_ids[None]) & has_id[None]

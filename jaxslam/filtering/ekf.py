@@ -54,10 +54,10 @@ def predict(
 ) -> Belief:
     """Move the belief by odometry; landmarks stay.
 
-        mean' = mean (+) motion        cov' = F cov F^T + G Q G^T
+        mean' = mean (+) odometry        cov' = F cov F^T + G Q G^T
 
-    An error of the heading swings the displacement (dx, dy) [m, world frame], and nothing else
-    changes between the old and the new pose's errors; G turns the noise into the world frame:
+    An error of the heading swings the displacement (dx, dy) [m, map frame], and nothing else
+    changes between the old and the new pose's errors; G turns the noise into the map frame:
 
              [1  0  -dy]             [R(heading)  0]
         F =  [0  1   dx]        G =  [    0       1]
@@ -67,7 +67,7 @@ def predict(
     additions. With "first_estimates" the displacement counts from the pose as last predicted.
 
     Args:
-        belief: Belief before the motion.
+        belief: Belief before the increment.
         odometry: (3,) odometry increment [m, m, rad], frame of the pose before it.
         odometry_cov: (3, 3) its covariance Q in the same frame.
         linearisation: One of `LINEARISATIONS`.
@@ -84,13 +84,13 @@ def predict(
     start = belief.first_estimate[:3] if linearisation == "first_estimates" else pose
     displacement = predicted[:2] - start[:2]
     by_heading = jnp.stack([-displacement[1], displacement[0]])  # d (x, y) / d heading, of F
-    to_world_frame = jnp.eye(3, dtype=odometry_cov.dtype).at[:2, :2].set(rotation(pose[2]))  # G
+    to_map_frame = jnp.eye(3, dtype=odometry_cov.dtype).at[:2, :2].set(rotation(pose[2]))  # G
     pose_cov = belief.pose_cov.at[:2].add(by_heading[:, None] * belief.pose_cov[2:])
     pose_cov = pose_cov.at[:, :2].add(pose_cov[:, 2:] * by_heading[None])
     return belief._replace(
         mean=belief.mean.at[:3].set(predicted),
         first_estimate=belief.first_estimate.at[:3].set(predicted),
-        pose_cov=pose_cov + to_world_frame @ odometry_cov @ to_world_frame.T,
+        pose_cov=pose_cov + to_map_frame @ odometry_cov @ to_map_frame.T,
         cross_cov=belief.cross_cov.at[:2].add(by_heading[:, None] * belief.cross_cov[2:]),
     )
 
@@ -121,31 +121,31 @@ def linearize(
     safe_slot = jnp.where(matched, slot, 0)
     kind = features.kind
     predict_all = jax.vmap(predict_measurement, in_axes=(None, 0, 0))
-    predicted, by_pose, by_slot = predict_all(
+    predicted, H_pose, H_landmark = predict_all(
         belief.pose, belief.landmark_positions[safe_slot], kind
     )
     if linearisation == "first_estimates":
-        first_places = belief.first_estimate[3:].reshape(-1, 2)
-        _, by_pose, by_slot = predict_all(belief.pose, first_places[safe_slot], kind)
+        first_positions = belief.first_estimate[3:].reshape(-1, 2)
+        _, H_pose, H_landmark = predict_all(belief.pose, first_positions[safe_slot], kind)
     keep = matched[:, None]
     eye = jnp.eye(2, dtype=R.dtype)
     return LinearizedMeasurements(
         residual=jnp.where(keep, residual(measure(features), predicted, kind), 0.0),
-        H_pose=jnp.where(keep[..., None], by_pose, 0.0),
-        H_landmark=jnp.where(keep[..., None], by_slot, 0.0),
+        H_pose=jnp.where(keep[..., None], H_pose, 0.0),
+        H_landmark=jnp.where(keep[..., None], H_landmark, 0.0),
         R=jnp.where(keep[..., None], R, eye),
         slot=safe_slot,
     )
 
 
 def update(
-    belief: Belief, seen: LinearizedMeasurements, *, linearisation: str = "standard"
+    belief: Belief, rows: LinearizedMeasurements, *, linearisation: str = "standard"
 ) -> tuple[Belief, UpdateResult]:
     """Kalman update by all innovations of a scan at once.
 
     Args:
         belief: Predicted belief.
-        seen: Linearised measurements, of `linearize`.
+        rows: Linearised measurements, of `linearize`.
         linearisation: One of `LINEARISATIONS`.
 
     Returns:
@@ -160,11 +160,11 @@ def update(
         3-D invariant-EKF SLAM".
     """
     check_linearisation(linearisation)
-    done = kalman_update(covariance_blocks(belief), seen)
-    shift, cov = done.shift, done.cov
+    result = kalman_update(covariance_blocks(belief), rows)
+    shift, cov = result.shift, result.cov
     if linearisation == "invariant":
         shift, cov = _retract_invariant(shift, cov, belief.kind == WALL)
-    return with_gaussian(belief, belief.mean + shift, cov), done
+    return with_gaussian(belief, belief.mean + shift, cov), result
 
 
 def _retract_invariant(

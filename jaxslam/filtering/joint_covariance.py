@@ -43,9 +43,21 @@ class LinearizedMeasurements(NamedTuple):
 
 
 def add_block_products(
-    cov: CovarianceBlocks, left: tuple[Array, Array], right: tuple[Array, Array], *, sign=1
+    cov: CovarianceBlocks, left: tuple[Array, Array], right: tuple[Array, Array], *, sign: int = 1
 ) -> CovarianceBlocks:
-    """Update of low rank, cov + sign left^T right; rows of pose (k, 3) and map (k, 2 L) each."""
+    """Update of low rank, cov + sign left^T right.
+
+    Args:
+        cov: The covariance; its map must be dense.
+        left: Columns of the pose (k, 3) and of the map (k, 2 L).
+        right: Likewise.
+        sign: 1 or -1.
+
+    Raises:
+        ValueError: The covariance of the map is deferred; while tracing.
+    """
+    if isinstance(cov.map, DeferredCovariance):
+        raise ValueError("cov.map is deferred: flush it before an update of the whole map")
     return CovarianceBlocks(
         pose=add_outer_products(cov.pose, left[0], right[0], sign=sign),
         cross=add_outer_products(cov.cross, left[0], right[1], sign=sign),

@@ -6,6 +6,9 @@ The covariance is kept in blocks, of the pose (3, 3), of pose and map (3, 2 L), 
 The derivative of the update is written by hand (`_bwd`), with its derivation.
 """
 
+import operator
+from collections.abc import Iterable
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -13,7 +16,7 @@ import jax.numpy as jnp
 
 from jaxslam.core.linalg import add_outer_products, inverse_cholesky
 from jaxslam.core.types import Array
-from jaxslam.filtering.covariance import downdate, slot_rows
+from jaxslam.filtering.covariance import DeferredCovariance, downdate, slot_rows
 from jaxslam.filtering.joint_covariance import CovarianceBlocks, LinearizedMeasurements
 
 
@@ -40,6 +43,14 @@ class _Columns(NamedTuple):
 
     pose: Array  # (N, 3) or (3,)
     map: Array  # (N, 2 L) or (2 L,)
+
+
+class _CovarianceGradient(NamedTuple):
+    """Derivative of a loss by a covariance, in its blocks."""
+
+    pose: Array  # (3, 3)
+    cross: Array  # (3, 2 L)
+    map: Array  # (2 L, 2 L)
 
 
 class _Saved(NamedTuple):
@@ -94,10 +105,10 @@ def innovation_cov(cov: CovarianceBlocks, rows: LinearizedMeasurements) -> Array
     return _project(cov, rows)[1]
 
 
-def log_likelihood(done: UpdateResult, dof: Array) -> Array:
-    """Log-likelihood () [nats] of the residuals, of which `dof` () int32 numbers count."""
-    numbers = dof.astype(done.nis.dtype)
-    return -0.5 * (done.nis + done.logdet + numbers * jnp.log(2 * jnp.pi).astype(done.nis.dtype))
+def log_likelihood(result: UpdateResult, dof: Array) -> Array:
+    """Log-likelihood () [nats] of the residuals, which have `dof` () int32 degrees of freedom."""
+    nis, logdet = result.nis, result.logdet
+    return -0.5 * (nis + logdet + dof.astype(nis.dtype) * jnp.log(2 * jnp.pi).astype(nis.dtype))
 
 
 def _project(cov: CovarianceBlocks, rows: LinearizedMeasurements) -> tuple[_Columns, Array]:
@@ -111,16 +122,21 @@ def _project(cov: CovarianceBlocks, rows: LinearizedMeasurements) -> tuple[_Colu
     hp_map = (hp_map + _small_matmul(rows.H_landmark, cov_slot_map)).reshape(n, -1)
     # H P H^T: columns of the pose, then those of each measurement's landmark.
     hp_slot = _slot_columns(hp_map, slot)  # (N, M, 2)
-    s = sum(hp_pose[:, None, None, k] * rows.H_pose[None, ..., k] for k in range(3))
-    s += sum(hp_slot[:, :, None, k] * rows.H_landmark[None, ..., k] for k in range(2))
+    s = _sum(hp_pose[:, None, None, k] * rows.H_pose[None, ..., k] for k in range(3))
+    s += _sum(hp_slot[:, :, None, k] * rows.H_landmark[None, ..., k] for k in range(2))
     eye = jnp.eye(slot.size, dtype=s.dtype)[:, None, :, None]
     s = s.reshape(-1, 2, n // 2, 2) + eye * rows.R[:, :, None]
     return _Columns(hp_pose, hp_map), s.reshape(n, n)
 
 
+def _sum(terms: Iterable[Array]) -> Array:
+    """Sum of a few arrays, in their order."""
+    return reduce(operator.add, terms)
+
+
 def _small_matmul(h: Array, x: Array) -> Array:
     """Product (..., 2, n) of h (..., 2, k) and x (..., k, n), as a sum of k terms: k is small."""
-    return sum(h[..., k, None] * x[..., None, k, :] for k in range(h.shape[-1]))
+    return _sum(h[..., k, None] * x[..., None, k, :] for k in range(h.shape[-1]))
 
 
 def _slot_columns(x: Array, slot: Array) -> Array:
@@ -135,7 +151,7 @@ def _transposed_matmul(left: Array, right: Array) -> Array:
 
 def _weighted_sum(weight: Array, rows: Array) -> Array:
     """rows^T weight (n,) for rows (k, n) and weights (k,)."""
-    return sum(weight[k] * rows[k] for k in range(len(weight)))
+    return _sum(weight[k] * rows[k] for k in range(len(weight)))
 
 
 def _shift(Y: _Columns, w: Array) -> Array:
@@ -213,8 +229,11 @@ def _bwd(saved: _Saved, grad: UpdateResult) -> tuple[CovarianceBlocks, Linearize
     rest is O(N^2 L).
     """
     rows, m = saved.rows, saved.rows.slot.size
+    if isinstance(grad.cov.map, DeferredCovariance):
+        raise ValueError("cov.map is deferred, which has no derivatives: flush it first")
     # Half of the stored block belongs to pose and map, half to map and pose.
-    G = CovarianceBlocks((grad.cov.pose + grad.cov.pose.T) / 2, grad.cov.cross / 2, grad.cov.map)
+    grad_pose = (grad.cov.pose + grad.cov.pose.T) / 2
+    G = _CovarianceGradient(grad_pose, grad.cov.cross / 2, grad.cov.map)
     g = _Columns(grad.shift[:3], grad.shift[3:])
     factors = _factors(saved, G, g)
     grad_v = factors.r + 2 * grad.nis * factors.u
@@ -227,12 +246,12 @@ def _bwd(saved: _Saved, grad: UpdateResult) -> tuple[CovarianceBlocks, Linearize
         H_landmark=grad_H_slot,
         # R has blocks on its diagonal only.
         R=grad_R.reshape(m, 2, m, 2)[jnp.arange(m), :, jnp.arange(m)],
-        slot=None,
+        slot=None,  # type: ignore[arg-type]  # an integer has no derivative
     )
     return grad_P, grad_rows
 
 
-def _factors(saved: _Saved, G: CovarianceBlocks, g: _Columns) -> _Factors:
+def _factors(saved: _Saved, G: _CovarianceGradient, g: _Columns) -> _Factors:
     """K^T, Q = K^T G, u = S^-1 v and r = K^T g, each as A^T times a product of Y or w."""
     inv_root, Y = saved.inv_root, saved.Y
     # Y G by blocks of columns; G.map is made symmetric here, as (Y G + (G Y^T)^T) / 2.
@@ -255,7 +274,11 @@ def _grad_R(inv_root: Array, factors: _Factors, grad_nis: Array, grad_logdet: Ar
 
 
 def _grad_P(
-    G: CovarianceBlocks, g: _Columns, grad_R: Array, factors: _Factors, rows: LinearizedMeasurements
+    G: _CovarianceGradient,
+    g: _Columns,
+    grad_R: Array,
+    factors: _Factors,
+    rows: LinearizedMeasurements,
 ) -> CovarianceBlocks:
     """G + 2 H^T X with X = -Q + u g^T / 2 + grad_R H / 2, by blocks; not symmetric.
 
@@ -269,8 +292,8 @@ def _grad_P(
     # X (N, D). The last term's columns are those of the pose, and of the measured slots.
     grad_R_by_row = grad_R.reshape(n, m, 2)
     x_pose = u[:, None] * g.pose[None] / 2 - Q.pose
-    x_pose += sum(grad_R_by_row[:, :, i] @ rows.H_pose[:, i] for i in range(2)) / 2
-    x_slot = sum(grad_R_by_row[:, :, i, None] * rows.H_landmark[None, :, i] for i in range(2)) / 2
+    x_pose += _sum(grad_R_by_row[:, :, i] @ rows.H_pose[:, i] for i in range(2)) / 2
+    x_slot = _sum(grad_R_by_row[:, :, i, None] * rows.H_landmark[None, :, i] for i in range(2)) / 2
     x_map = u[:, None] * g.map[None] / 2 - Q.map
     x_map = x_map.reshape(n, size, 2).at[:, slot].add(x_slot).reshape(n, -1)
 
@@ -288,7 +311,7 @@ def _grad_P(
 
 def _slot_rows(by_slot: Array, x: Array) -> Array:
     """Rows (M, 2, k) of H^T X at the slots, for rows x (M, 2, k) of the measurements."""
-    return sum(by_slot[:, i, :, None] * x[:, i, None] for i in range(2))
+    return _sum(by_slot[:, i, :, None] * x[:, i, None] for i in range(2))
 
 
 def _grad_H(

@@ -39,8 +39,8 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     hp_map = hp_map[0] - hp_map[1]  # (2, 2 L)
     variance = std**2 * jnp.eye(2, dtype=hp_map.dtype)
     s = difference(hp_map.reshape(2, size, 2)[:, pair]) + variance
-    root, _, good = inverse_cholesky(s)
-    root = jnp.where(found & good, root, 0.0)
+    root, _, is_definite = inverse_cholesky(s)
+    root = jnp.where(found & is_definite, root, 0.0)
     y_pose, y_map = root @ hp_pose, root @ hp_map
     white_residual = -root @ difference(belief.landmark_positions[pair])
     cov = CovarianceBlocks(
@@ -50,10 +50,10 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     )
     shift = jnp.concatenate([white_residual @ y_pose, white_residual @ y_map])
     belief = with_gaussian(belief, belief.mean + shift, cov)
-    gone = found & good & (jnp.arange(size, dtype=jnp.int32) == drop)
-    times_seen = belief.num_seen.at[drop].get(mode="fill", fill_value=0)
-    times_seen = jnp.where(found & good, times_seen, 0)
-    belief = belief._replace(num_seen=belief.num_seen.at[keep].add(times_seen))
+    gone = found & is_definite & (jnp.arange(size, dtype=jnp.int32) == drop)
+    observations = belief.num_seen.at[drop].get(mode="fill", fill_value=0)
+    observations = jnp.where(found & is_definite, observations, 0)
+    belief = belief._replace(num_seen=belief.num_seen.at[keep].add(observations))
     return prune(belief, gone)
 
 
@@ -82,8 +82,8 @@ def augment(
         R: (M, 2, 2) their covariance R: range [m] and bearing [rad], or direction [rad] and 0.
         wanted: (M,) bool, features to initialise as landmarks.
         max_new: How many at most, F; the first come first.
-        new_slot: (M,) int32 slot of each, which is its ID too; by default the slots of least eviction
-            cost, and the next IDs.
+        new_slot: (M,) int32 slot of each, which is its ID too; by default the slots of least
+            eviction cost, and the next IDs.
         cost: (L,) eviction cost of the slots, infinite where it must not be evicted; by default
             only free slots are used.
         linearisation: One of `LINEARISATIONS`.
@@ -151,7 +151,7 @@ def _inverse_model(
 ) -> tuple[Array, Array, Array]:
     """Inverse measurement model l = g(pose, z) of F features, and its Jacobians.
 
-    With p the feature's position in the world, o = p - pose_xy, and s = p - start,
+    With p the feature's position in the map, o = p - pose_xy, and s = p - start,
 
         junction, corner:  l = p,             G_p = [1  0  -s_y]   G_z = [o / |o|, (-o_y, o_x)]
                                                     [0  1   s_x]
@@ -159,11 +159,11 @@ def _inverse_model(
                                                     [0  0  0]            [0  0]
 
     Args:
-        pose: (3,) mean pose, world frame.
+        pose: (3,) mean pose, map frame.
         start: (2,) position of the robot at which G_p is taken.
-        xy: (F, 2) positions of the features [m], robot frame.
+        xy: (F, 2) positions of the features [m], base_link frame.
         kind: (F,) int32.
-        direction: (F,) [rad] robot frame, of walls.
+        direction: (F,) [rad] base_link frame, of walls.
 
     Returns:
         Values l of the landmarks (2 F,), G_p (F, 2, 3) and G_z (F, 2, 2).
@@ -213,19 +213,19 @@ def _new_covariance(
     return with_pose, with_map.reshape(2 * count, -1), with_new.reshape(2 * count, -1)
 
 
-def claim_slots(worth: Array, wanted: Array) -> Array:
+def claim_slots(cost: Array, wanted: Array) -> Array:
     """Assign slots to features, the cheapest slot to the first feature.
 
     Args:
-        worth: (L,) eviction cost of each slot: 0 for a free one, infinite for one that must not be
+        cost: (L,) eviction cost of each slot: 0 for a free one, infinite for one that must not be
             evicted.
         wanted: (M,) bool, features that need a slot.
 
     Returns:
         (M,) int32 slot of each feature; L, out of range, where it gets none.
     """
-    num_slots = worth.size
-    negative_cost, order = lax.top_k(-worth, min(num_slots, wanted.size))  # of equals the first
+    num_slots = cost.size
+    negative_cost, order = lax.top_k(-cost, min(num_slots, wanted.size))  # of equals the first
     turn = jnp.cumsum(wanted, dtype=jnp.int32) - 1  # of each feature in the queue
     rank = jnp.clip(turn, 0, order.size - 1)
     available = wanted & (turn < order.size) & (negative_cost[rank] > -jnp.inf)

@@ -28,7 +28,7 @@ def verify_matches(
         consistent = matches that pass the joint compatibility test        (`jointly_compatible`)
         uncertain  = point landmarks whose position relative to the robot has a large covariance
         supported  = another consistent point match lies at the right distance,
-                     or this is the `spec.looks`-th scan in a row with such a match
+                     or this is the `spec.verify_scans`-th scan in a row with such a match
         accepted   = consistent and (not uncertain or supported)
 
     The gate of a landmark that was out of view for long is wide, and may contain other landmarks.
@@ -66,8 +66,11 @@ def verify_matches(
     accepted = consistent & (~uncertain | supported)
     pending = is_point & consistent & ~accepted
     size = belief.num_seen.size
-    looks = belief.num_pending.at[jnp.where(accepted, linearized.slot, size)].set(0, mode="drop")
-    return accepted, looks.at[jnp.where(pending, linearized.slot, size)].add(1, mode="drop")
+    num_pending = belief.num_pending.at[jnp.where(accepted, linearized.slot, size)].set(
+        0, mode="drop"
+    )
+    num_pending = num_pending.at[jnp.where(pending, linearized.slot, size)].add(1, mode="drop")
+    return accepted, num_pending
 
 
 def _position_variance(rows: LinearizedMeasurements, s: Array, squared_range: Array) -> Array:
@@ -84,7 +87,7 @@ def _position_variance(rows: LinearizedMeasurements, s: Array, squared_range: Ar
 def _distances_agree(
     spec: AssociationSpec,
     belief: Belief,
-    nodes: Features,
+    features: Features,
     rows: LinearizedMeasurements,
     squared_range: Array,
 ) -> Array:
@@ -93,17 +96,17 @@ def _distances_agree(
     The squared difference of the two distances must be inside the gate. The variance of a distance
     is bounded by the trace of the covariance of the offset: of the landmarks
     tr P_ii + tr P_jj - 2 tr P_ij, of the features tr F_i + tr F_j with tr F = R_r + r^2 R_bearing.
-    Features nearer to each other than `spec.witness` do not count.
+    Features nearer to each other than `spec.support_distance` do not count.
     """
     count, size = rows.slot.size, belief.num_seen.size
     index = jnp.arange(count, dtype=jnp.int32)
-    measured = _pairwise_distances(nodes.xy)
+    measured = _pairwise_distances(features.xy)
     mapped = _pairwise_distances(belief.landmark_positions[rows.slot])
     map_cov = slot_rows(belief.map_cov, rows.slot).reshape(count, 2, size, 2)[:, :, rows.slot]
     own = _trace(map_cov[index, :, index])
     map_variance = own[:, None] + own[None] - 2 * _trace(jnp.moveaxis(map_cov, 2, 1))
-    feature = rows.R[:, 0, 0] + squared_range * rows.R[:, 1, 1]
-    variance = map_variance + feature[:, None] + feature[None]
+    feature_variance = rows.R[:, 0, 0] + squared_range * rows.R[:, 1, 1]
+    variance = map_variance + feature_variance[:, None] + feature_variance[None]
     agrees = (measured - mapped) ** 2 < spec.gate * jnp.maximum(variance, 0.0)
     return agrees & (measured > spec.support_distance) & (index[:, None] != index[None])
 
@@ -136,8 +139,8 @@ def missed_detection(belief: Belief, field_of_view: tuple[float, float]) -> Arra
 
     Args:
         belief: Updated belief.
-        field_of_view: First and last bearing [rad] of the scanner, base_link frame. A scanner of a whole
-            turn (to 0.1 rad) sees all around.
+        field_of_view: First and last bearing [rad] of the scanner, base_link frame. A scanner of a
+            whole turn (to 0.1 rad) sees all around.
     """
     offset = belief.landmark_positions - belief.pose[None, :2]
     distance = jnp.sqrt(jnp.sum(offset**2, axis=1))
@@ -153,8 +156,9 @@ def missed_detection(belief: Belief, field_of_view: tuple[float, float]) -> Arra
 def find_duplicate(spec: AssociationSpec, belief: Belief, slot: Array) -> Array:
     """Find a duplicate of a landmark: another slot that holds the same physical landmark.
 
-    A duplicate has the same kind (not a wall), a similar descriptor, is nearer than `spec.apart`,
-    and inside the gate by the covariance of the offset between landmarks i and j,
+    A duplicate has the same kind (not a wall) and a similar descriptor, is nearer than
+    `spec.min_separation`, and inside the gate by the covariance of the offset between landmarks i
+    and j,
 
         S = P_ii + P_jj - P_ij - P_ij^T + (1 cm)^2 I
 
@@ -183,8 +187,8 @@ def find_duplicate(spec: AssociationSpec, belief: Belief, slot: Array) -> Array:
         descriptor,
         descriptor[landmark],
         facing,
-        shape=spec.max_log_clearance_ratio,
-        turn=spec.max_corner_difference,
+        max_log_clearance_ratio=spec.max_log_clearance_ratio,
+        max_corner_difference=spec.max_corner_difference,
     )
     is_duplicate &= (kind == kind[landmark]) & (kind != WALL) & (belief.num_seen > 0)
     is_duplicate &= (index != landmark) & (slot < size)

@@ -53,23 +53,23 @@ def predict_measurement(pose: Array, position: Array, kind: Array) -> tuple[Arra
     References:
         Paper, eqs. (6)-(8); the bearing of (7) corrected by the robot's heading.
     """
-    point, point_by_pose, point_by_slot = _expect_point(pose, position)
-    wall, wall_by_pose, wall_by_slot = _expect_wall(pose, position)
+    point, point_by_pose, point_by_landmark = _predict_point(pose, position)
+    wall, wall_by_pose, wall_by_landmark = _predict_wall(pose, position)
     is_wall = kind == WALL
     return (
         jnp.where(is_wall, wall, point),
         jnp.where(is_wall, wall_by_pose, point_by_pose),
-        jnp.where(is_wall, wall_by_slot, point_by_slot),
+        jnp.where(is_wall, wall_by_landmark, point_by_landmark),
     )
 
 
-def _expect_point(pose: Array, place: Array) -> tuple[Array, Array, Array]:
+def _predict_point(pose: Array, position: Array) -> tuple[Array, Array, Array]:
     """`predict_measurement` of a junction or corner.
 
     On the landmark itself (within 0.1 mm) there is no bearing: the offset (1, 0) stands in for it,
     so that all derivatives stay finite, and the range is 0.
     """
-    offset = place - pose[:2]
+    offset = position - pose[:2]
     square = jnp.sum(offset**2)
     is_away = square > 1e-8
     square = jnp.where(is_away, square, 1.0)
@@ -77,19 +77,19 @@ def _expect_point(pose: Array, place: Array) -> tuple[Array, Array, Array]:
     dx, dy = jnp.where(is_away, offset, jnp.array([1.0, 0.0], offset.dtype))
     bearing = wrap_angle(jnp.arctan2(dy, dx) - pose[2])
     zero, one = jnp.zeros_like(dx), jnp.ones_like(dx)
-    by_slot = jnp.stack(
+    by_landmark = jnp.stack(
         [jnp.stack([dx / distance, dy / distance]), jnp.stack([-dy / square, dx / square])]
     )
-    by_pose = jnp.concatenate([-by_slot, jnp.stack([zero, -one])[:, None]], axis=1)
-    return jnp.stack([jnp.where(is_away, distance, 0.0), bearing]), by_pose, by_slot
+    by_pose = jnp.concatenate([-by_landmark, jnp.stack([zero, -one])[:, None]], axis=1)
+    return jnp.stack([jnp.where(is_away, distance, 0.0), bearing]), by_pose, by_landmark
 
 
-def _expect_wall(pose: Array, place: Array) -> tuple[Array, Array, Array]:
+def _predict_wall(pose: Array, position: Array) -> tuple[Array, Array, Array]:
     """`predict_measurement` of a wall direction."""
-    direction = wrap_direction(place[0] - pose[2])
-    by_pose = jnp.zeros((2, 3), place.dtype).at[0, 2].set(-1.0)
-    by_slot = jnp.zeros((2, 2), place.dtype).at[0, 0].set(1.0)
-    return jnp.stack([direction, jnp.zeros_like(direction)]), by_pose, by_slot
+    direction = wrap_direction(position[0] - pose[2])
+    by_pose = jnp.zeros((2, 3), position.dtype).at[0, 2].set(-1.0)
+    by_landmark = jnp.zeros((2, 2), position.dtype).at[0, 0].set(1.0)
+    return jnp.stack([direction, jnp.zeros_like(direction)]), by_pose, by_landmark
 
 
 def wrapped_differences(x: Array, y: Array, is_wall: Array) -> tuple[Array, Array]:
@@ -106,13 +106,13 @@ def wrapped_differences(x: Array, y: Array, is_wall: Array) -> tuple[Array, Arra
     return jnp.where(is_wall, wrap_direction(x), x), jnp.where(is_wall, 0.0, wrap_angle(y))
 
 
-def residual(seen: Array, expected: Array, kind: Array) -> Array:
+def residual(measured: Array, predicted: Array, kind: Array) -> Array:
     """Innovations (..., 2): measurement minus prediction, angles wrapped.
 
     Args:
-        seen: (..., 2) measurements, as of `measure`.
-        expected: (..., 2) predictions, as of `predict_measurement`.
+        measured: (..., 2) measurements, as of `measure`.
+        predicted: (..., 2) predictions, as of `predict_measurement`.
         kind: (...) int32 kinds of landmark.
     """
-    error = seen - expected
+    error = measured - predicted
     return jnp.stack(wrapped_differences(error[..., 0], error[..., 1], kind == WALL), axis=-1)

@@ -1,6 +1,8 @@
 """Noise parameters of the filter: process noise Q of odometry, measurement noise R of features."""
 
-from typing import NamedTuple
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,17 +21,17 @@ class NoiseParams(NamedTuple):
     Every field is a standard deviation or a factor on one, never a variance.
 
     Attributes:
-        odometry_coefficients: (4,) coefficients of Q in `motion_model.odometry_cov`, standard deviations that grow
-            with the root of what was driven: distance per distance [m / sqrt(m)], distance per
-            rotation [m / sqrt(rad)], heading per distance [rad / sqrt(m)], heading per rotation
-            [rad / sqrt(rad)].
+        odometry_coefficients: (4,) coefficients of Q in `motion_model.odometry_cov`, standard
+            deviations that grow with the root of what was driven: distance per distance
+            [m / sqrt(m)], distance per rotation [m / sqrt(rad)], heading per distance
+            [rad / sqrt(m)], heading per rotation [rad / sqrt(rad)]; 0 for none.
         range_std: () [m] of a point feature's range, added (as a variance) to the feature's own
             covariance from the front end.
         bearing_std: () [rad] of a point feature's bearing, added likewise.
         feature_std_scale: () [-] factor on the front end's own standard deviation of a feature.
         wall_angle_std: () [rad] of a wall's direction, added likewise to the wall's own variance.
-        scan_match_std_scale: () [-] factor on the standard deviation of scan-matched odometry; None where no
-            scans are matched.
+        scan_match_std_scale: () [-] factor on the standard deviation of scan-matched odometry; None
+            where no scans are matched.
     """
 
     odometry_coefficients: Array
@@ -48,10 +50,15 @@ class NoiseParams(NamedTuple):
         Args:
             wheel_base: [m] between the wheels.
             encoder_noise: [m / sqrt(m)] standard deviation of an encoder.
+
+        Raises:
+            ValueError: One of them is not positive and finite.
         """
-        return cls(
-            wheel_coefficients(wheel_base, encoder_noise), 0.002, 0.001, 0.85, 0.0001
-        ).as_arrays()
+        for name, value in (("wheel_base", wheel_base), ("encoder_noise", encoder_noise)):
+            if not (isinstance(value, jax.core.Tracer) or 0.0 < value < math.inf):
+                raise ValueError(f"{name} is {value!r}, not positive and finite")
+        odometry = wheel_coefficients(wheel_base, encoder_noise)
+        return cls(*_arrays(odometry, 0.002, 0.001, 0.85, 0.0001))
 
     @classmethod
     def for_laser_log(cls, *, match_scans: bool = False) -> "NoiseParams":
@@ -62,17 +69,18 @@ class NoiseParams(NamedTuple):
                 less: where the robot slips, it must not bias the heading that the scans determine.
         """
         if match_scans:
-            return cls([0.1, 0.1, 0.2, 0.4], 0.05, 0.01, 1.5, 0.03, 0.3).as_arrays()
-        return cls([0.05, 0.05, 0.05, 0.05], 0.05, 0.01, 1.5, 0.03).as_arrays()
+            return cls(*_arrays([0.1, 0.1, 0.2, 0.4], 0.05, 0.01, 1.5, 0.03, 0.3))
+        return cls(*_arrays([0.05, 0.05, 0.05, 0.05], 0.05, 0.01, 1.5, 0.03))
 
     @classmethod
     def for_landmark_sensor(cls) -> "NoiseParams":
         """Hand-set noise for a small robot that measures range and bearing of known landmarks."""
-        return cls([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03).as_arrays()
+        return cls(*_arrays([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03))
 
-    def as_arrays(self) -> "NoiseParams":
-        """The same numbers as arrays of JAX's default float type."""
-        return NoiseParams(*(x if x is None else jnp.asarray(x, float) for x in self))
+
+def _arrays(*numbers: Any) -> Iterator[Array]:
+    """Numbers as arrays of JAX's default float type."""
+    return (jnp.asarray(x, float) for x in numbers)
 
 
 def measurement_cov(
@@ -84,14 +92,14 @@ def measurement_cov(
         wall:   R = diag(f^2 v + s_wall^2, 1)                          [rad, -]
 
     C is the front end's covariance of the position, J the Jacobian of range and bearing, v the
-    front end's variance of a wall's direction, f the factor `params.scale`, and s_ the standard
-    deviations in `params`. k is 1 for a trusted point and `untrusted_inflation` for another. The second number of
-    a wall's measurement is always 0; its variance 1 is a placeholder.
+    front end's variance of a wall's direction, f the factor `params.feature_std_scale`, and s_ the
+    standard deviations in `params`. k is 1 for a trusted point and `untrusted_inflation` for
+    another. The second number of a wall's measurement is always 0; its variance 1 is a placeholder.
 
     Args:
         params: Noise parameters.
         features: Features of a scan.
-        untrusted_inflation: Inflation factor on the standard deviation of points that are not trusted.
+        untrusted_inflation: Factor on the standard deviation of points that are not trusted.
     """
     own = jax.vmap(measurement_model.polar_cov)(features.xy, features.cov)
     added = jnp.diag(jnp.stack([params.range_std, params.bearing_std]) ** 2)
@@ -106,18 +114,23 @@ def measurement_cov(
 def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Array, Array]:
     """Odometry increment of a step, fused with scan matching where there is any.
 
+    Args:
+        params: Noise parameters.
+        measurement: Odometry, and scan matching if any.
+
     Returns:
         The increment (3,) [m, m, rad] since the step before, in the frame of that pose, and its
         covariance (3, 3).
 
     Raises:
-        ValueError: There is scan matching, and `params.alignment` is None; while tracing.
+        ValueError: There is scan matching, and `params.scan_match_std_scale` is None; while
+            tracing.
     """
     motion_cov = odometry_cov(params.odometry_coefficients, measurement.odometry)
     if measurement.scan_match is None:
         return measurement.odometry, motion_cov
     if params.scan_match_std_scale is None:
-        raise ValueError("noise.alignment is None, but odometry by scan matching is given")
+        raise ValueError("params.scan_match_std_scale is None, but measurement.scan_match is given")
     return scan_matching.fuse_odometry(
-        measurement.odometry, motion_cov, measurement.scan_match, params.scan_match_std_scale
+        params.scan_match_std_scale, measurement.odometry, motion_cov, measurement.scan_match
     )

@@ -12,8 +12,9 @@ from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering import ekf
 from jaxslam.filtering.belief import Belief
-from jaxslam.filtering.config import FilterConfig, required_observations
-from jaxslam.filtering.data_association import Association, associate, use_known_ids
+from jaxslam.filtering.config import FilterConfig, check_config, required_observations
+from jaxslam.filtering.data_association import Association, Matches, associate, use_known_ids
+from jaxslam.filtering.inputs import check_inputs
 from jaxslam.filtering.joint_covariance import LinearizedMeasurements, mask_measurements
 from jaxslam.filtering.kalman import UpdateResult, innovation_cov, log_likelihood
 from jaxslam.filtering.match_verification import verify_matches
@@ -55,24 +56,10 @@ class StepInfo(NamedTuple):
     num_merged: Array
 
 
-class _Matches(NamedTuple):
-    """Matches of the features of a scan, as `step` narrows them down.
-
-    Attributes:
-        slot: (M,) int32 slot of the matched landmark, L for none.
-        used: (M,) bool, the match updates the state; a match with an unconfirmed landmark does not.
-        order: (K,) int32 feature of each of the K rows of the update.
-    """
-
-    slot: Array
-    used: Array
-    order: Array
-
-
 def step(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> tuple[Belief, StepInfo]:
-    """One step of EKF-SLAM.
+    """One step of EKF-SLAM; compiled once for a configuration and the shapes.
 
         select     the features of the configured kinds; their covariance R
         predict    the belief by the odometry increment
@@ -84,9 +71,10 @@ def step(
         manage     the tracks: record observations, prune landmarks, merge duplicates
         add        new landmarks, evicting unconfirmed ones from a full map
 
-    With `measurement.known` correspondences are given: nothing is associated, verified, pruned or
-    merged, and a landmark is confirmed by its first observation. No more than `config.matches`
-    features update the state in a step, and no more than `config.fresh` become landmarks.
+    With `measurement.landmark_ids` correspondences are known: nothing is associated, verified,
+    pruned or merged, and a landmark is confirmed by its first observation. No more than
+    `config.max_updates` features update the state in a step, and no more than `config.max_new`
+    become landmarks.
 
     Correspondences are integers: derivatives are those of the filter with correspondences fixed.
 
@@ -94,24 +82,32 @@ def step(
         config: Static configuration.
         params: Standard deviations of odometry and features.
         belief: Belief after the step before.
-        measurement: Odometry increment and features of this step.
+        measurement: Odometry increment (3,) and features (M) of this step; NumPy arrays and lists
+            are taken, too.
+
+    Returns:
+        The belief after the step, and its diagnostics.
 
     Raises:
-        ValueError: `measurement.known` has another shape or type than the features, or there is scan
-            matching and `params.alignment` is None; while tracing.
+        ValueError: The configuration is wrong (`check_config`), or a shape, type or concrete value
+            of the parameters or of the measurement (`inputs.check_inputs`).
 
     References:
         Paper, section 3, eqs. (1)-(16). Thrun, Burgard, Fox (2005), Probabilistic Robotics,
         chapter 10.
     """
+    check_config(config)
+    params, measurement = check_inputs(params, belief, measurement, over_time=False)
+    return _compiled_step(config, params, belief, measurement)
+
+
+def _step(
+    config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
+) -> tuple[Belief, StepInfo]:
+    """`step`, of inputs that are checked."""
     is_known = measurement.landmark_ids is not None
     if is_known:
-        config = config._replace(
-            filter=config._replace(
-                confirm_count=1,
-                wall_confirm_count=1,
-            ),
-        )
+        config = config._replace(confirm_count=1, wall_confirm_count=1)
     features, features_cov = _select(config, params, measurement.features)
     predicted = _predict(config, params, belief, measurement)
     found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
@@ -129,21 +125,26 @@ def step(
     return mapped, info
 
 
-def _select(config: FilterConfig, noise: NoiseParams, features: Features) -> tuple[Features, Array]:
+_compiled_step = partial(jax.jit, static_argnames="config")(_step)
+
+
+def _select(
+    config: FilterConfig, params: NoiseParams, features: Features
+) -> tuple[Features, Array]:
     """Features of the configured kinds, and their measurement covariance R (M, 2, 2)."""
     allowed = jnp.isin(features.kind, jnp.array(config.landmark_kinds, jnp.int32))
     features = restrict_features(features, allowed)
     return features, measurement_cov(
-        noise, features, untrusted_inflation=config.untrusted_inflation
+        params, features, untrusted_inflation=config.untrusted_inflation
     )
 
 
 def _predict(
-    config: FilterConfig, noise: NoiseParams, belief: Belief, inputs: Measurement
+    config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> Belief:
     """Predict by the odometry increment, and count the step."""
-    motion, motion_cov = motion_estimate(noise, inputs)
-    belief = ekf.predict(belief, motion, motion_cov, linearisation=config.linearisation)
+    odometry, odometry_cov = motion_estimate(params, measurement)
+    belief = ekf.predict(belief, odometry, odometry_cov, linearisation=config.linearisation)
     return belief._replace(step=belief.step + 1)
 
 
@@ -152,16 +153,16 @@ def _associate(
     belief: Belief,
     features: Features,
     features_cov: Array,
-    known: Array | None,
+    landmark_ids: Array | None,
 ) -> Association:
     """Associate features with landmarks, by known ids where they are given."""
-    if known is not None:
-        return use_known_ids(belief, features, known)
+    if landmark_ids is not None:
+        return use_known_ids(belief, features, landmark_ids)
     return associate(config.association, belief, features, features_cov)
 
 
-def _choose(config: FilterConfig, belief: Belief, features: Features, slot: Array) -> _Matches:
-    """Choose the matches that update the state, no more than `config.matches`.
+def _choose(config: FilterConfig, belief: Belief, features: Features, slot: Array) -> Matches:
+    """Choose the matches that update the state, no more than `config.max_updates`.
 
     Only landmarks that this observation confirms, or that are confirmed already, are used. Wall
     directions come first, then the order of the front end.
@@ -172,11 +173,11 @@ def _choose(config: FilterConfig, belief: Belief, features: Features, slot: Arra
     priority = jnp.where(used, jnp.where(features.kind == WALL, 2, 1), 0)
     order = jnp.argsort(-priority, stable=True)[: config.max_updates]
     used &= jnp.zeros_like(used).at[order].set(True)
-    return _Matches(slot, used, order)
+    return Matches(slot, used, order)
 
 
 def _linearise(
-    config: FilterConfig, belief: Belief, features: Features, features_cov: Array, matches: _Matches
+    config: FilterConfig, belief: Belief, features: Features, features_cov: Array, matches: Matches
 ) -> tuple[Features, LinearizedMeasurements]:
     """Features (K) of the rows of the update, and their innovations with Jacobians."""
     used_slot = jnp.where(matches.used, matches.slot, belief.num_seen.size)
@@ -194,8 +195,8 @@ def _verify(
     belief: Belief,
     chosen: Features,
     rows: LinearizedMeasurements,
-    matches: _Matches,
-) -> tuple[Belief, LinearizedMeasurements, _Matches]:
+    matches: Matches,
+) -> tuple[Belief, LinearizedMeasurements, Matches]:
     """Drop the matches that `verify_matches` rejects.
 
     Returns:
@@ -203,22 +204,22 @@ def _verify(
         left. A rejected match does not count as an observation of its landmark, either.
     """
     joint_cov = lax.stop_gradient(innovation_cov(ekf.covariance_blocks(belief), rows))
-    accepted, looks = verify_matches(config.association, belief, chosen, rows, joint_cov)
-    rows, belief = mask_measurements(rows, accepted), belief._replace(num_pending=looks)
+    accepted, num_pending = verify_matches(config.association, belief, chosen, rows, joint_cov)
+    rows, belief = mask_measurements(rows, accepted), belief._replace(num_pending=num_pending)
     slot, used, order = matches
     rejected = used & jnp.zeros_like(used).at[order].set(~accepted)
     slot = jnp.where(rejected, belief.num_seen.size, slot)
-    return belief, rows, _Matches(slot, used & ~rejected, order)
+    return belief, rows, Matches(slot, used & ~rejected, order)
 
 
 def _update(
-    config: FilterConfig, belief: Belief, rows: LinearizedMeasurements, matches: _Matches
-) -> tuple[Belief, UpdateResult, _Matches]:
+    config: FilterConfig, belief: Belief, rows: LinearizedMeasurements, matches: Matches
+) -> tuple[Belief, UpdateResult, Matches]:
     """Update by all rows at once, unless the result is not finite.
 
     Returns:
         The belief, the result of the update, and the matches. Where the updated mean is not finite,
-        `result.good` is False and no match is left. An update that fails changes no covariance, so
+        `result.ok` is False and no match is left. An update that fails changes no covariance, so
         only the mean is restored.
     """
     updated, result = ekf.update(belief, rows, linearisation=config.linearisation)
@@ -232,7 +233,7 @@ def _update(
 def _step_info(
     belief: Belief,
     features: Features,
-    matches: _Matches,
+    matches: Matches,
     new_slot: Array,
     result: UpdateResult,
     *,
@@ -262,11 +263,10 @@ def _step_info(
     )
 
 
-@partial(jax.jit, static_argnames="config")
 def run_filter(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurements: Measurement
 ) -> tuple[Belief, StepInfo]:
-    """Run the filter over one log.
+    """Run the filter over one log; compiled once for a configuration and the shapes.
 
     For a derivative, only the rows of the covariance that each step touched are kept, never the
     whole. Derivatives are taken in reverse mode only (`kalman.kalman_update`).
@@ -275,13 +275,27 @@ def run_filter(
         config: Static configuration.
         params: Standard deviations of odometry and features.
         belief: Belief before the first step.
-        measurements: [T] measurements.
+        measurements: [T] measurements: odometry (T, 3), features (T, M); NumPy arrays and lists are
+            taken, too.
 
     Returns:
         The belief after the last step, and the diagnostics [T].
+
+    Raises:
+        ValueError: As of `step`, and where the T of two fields differ.
     """
+    check_config(config)
+    params, measurements = check_inputs(params, belief, measurements, over_time=True)
+    return _run(config, params, belief, measurements)
+
+
+@partial(jax.jit, static_argnames="config")
+def _run(
+    config: FilterConfig, params: NoiseParams, belief: Belief, measurements: Measurement
+) -> tuple[Belief, StepInfo]:
+    """`run_filter`, of inputs that are checked."""
 
     def body(belief: Belief, now: Measurement) -> tuple[Belief, StepInfo]:
-        return step(config, params, belief, now)
+        return _step(config, params, belief, now)
 
     return lax.scan(body, belief, measurements)

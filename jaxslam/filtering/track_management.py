@@ -7,18 +7,24 @@ from jaxslam.core.types import Array
 from jaxslam.filtering import map_management
 from jaxslam.filtering.belief import Belief, eviction_cost, prune, record_observations
 from jaxslam.filtering.config import FilterConfig, confirmed
-from jaxslam.filtering.data_association import Association
+from jaxslam.filtering.data_association import Association, Matches
 from jaxslam.filtering.match_verification import find_duplicate, missed_detection
-from jaxslam.filtering.slam_filter import _Matches
 
 
 def manage_tracks(
-    config: FilterConfig, belief: Belief, features: Features, matches: _Matches, is_known: bool
+    config: FilterConfig, belief: Belief, features: Features, matches: Matches, is_known: bool
 ) -> tuple[Belief, Array, Array]:
     """Record the observations, prune landmarks that are not there, merge duplicates.
 
     Where correspondences are known, observations are recorded only. Of the landmarks that updated
     the state one is checked for a duplicate, in turn: row `step % K` of the update.
+
+    Args:
+        config: Static configuration.
+        belief: Updated belief.
+        features: Features of the scan.
+        matches: Their matches.
+        is_known: Whether correspondences are known.
 
     Returns:
         The belief, and the numbers () int32 of pruned landmarks and of merged duplicates.
@@ -43,9 +49,8 @@ def _prune(config: FilterConfig, belief: Belief, any_feature: Array) -> tuple[Be
     Returns:
         The belief, and the number () int32 of pruned landmarks.
     """
-    lidar = config.lidar
-    view = lidar.angle_min, lidar.angle_min + lidar.angle_increment * (lidar.num_beams - 1)
-    missed = missed_detection(belief, view) & (belief.last_seen < belief.step) & any_feature
+    missed = missed_detection(belief, config.field_of_view)
+    missed &= (belief.last_seen < belief.step) & any_feature
     belief = belief._replace(num_missed=jnp.where(missed, belief.num_missed + 1, belief.num_missed))
     pruned = ~confirmed(config, belief) & (
         belief.step - belief.last_seen > config.max_unconfirmed_age
@@ -80,6 +85,13 @@ def add_landmarks(
     found: Association,
 ) -> tuple[Belief, Array, Array]:
     """Add the new features to the map; a full map evicts unconfirmed landmarks for them.
+
+    Args:
+        config: Static configuration.
+        belief: Belief with its tracks managed.
+        features: Features of the scan.
+        features_cov: (M, 2, 2) their measurement covariance R.
+        found: Their association, which says which are new.
 
     Returns:
         The belief, the slot (M,) int32 of each new landmark (L for none), and the number () int32

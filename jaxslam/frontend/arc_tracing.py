@@ -9,9 +9,13 @@ from jaxslam.frontend.grid import GridSpec, centre_of
 from jaxslam.frontend.id_propagation import MAX_ARC_STEPS, PropagatedIds
 
 POLYLINE_POINTS = 9  # points K of a polyline
-POLYLINE_SUBSAMPLES = 4  # segments, per segment of the polyline, with which a link is measured
+POLYLINE_SUBSAMPLES = 4  # pieces, per piece of the polyline, with which an arc is measured
 SMOOTHING_PASSES = 4  # passes of smoothing over the staircase of cells
 BRANCH_BONUS = 5  # by which a cell on a branch is preferred in `trace_back`, in half steps
+
+
+_Trace = tuple[Array, Array, Array, Array, Array]
+"""Number of steps, cell and limit (P, 2) of each, and cells and moves so far (S, P, 2)."""
 
 
 def trace_back(pair: Array, cell: Array, ids: PropagatedIds, bit: Array) -> tuple[Array, Array]:
@@ -42,11 +46,11 @@ def trace_back(pair: Array, cell: Array, ids: PropagatedIds, bit: Array) -> tupl
     width = ids.packed.shape[1] + 2
     ids_at = jnp.pad(ids.ids, 1).reshape(-1)
     packed_at = jnp.pad(ids.packed, 1, constant_values=-1).reshape(-1)
-    neighbours = [-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1]
-    neighbours = jnp.array(neighbours, jnp.int32)
+    offsets = [-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1]
+    neighbours = jnp.array(offsets, jnp.int32)
     own = bit[jnp.where(pair < 0, len(bit) - 1, pair)][..., None]  # (P, 2, 1)
 
-    def step(now: tuple[Array, ...]) -> tuple[Array, ...]:
+    def step(now: _Trace) -> _Trace:
         k, at, limit, cells, moved = now
         near = at[..., None] + neighbours[None, None]  # (P, 2, 8)
         packed = packed_at[near]
@@ -62,7 +66,7 @@ def trace_back(pair: Array, cell: Array, ids: PropagatedIds, bit: Array) -> tupl
         limit = jnp.where(moves, best_packed // 2, limit)
         return k + 1, at, limit, cells.at[k].set(at), moved.at[k].set(moves)
 
-    def unfinished(now: tuple[Array, ...]) -> Array:
+    def unfinished(now: _Trace) -> Array:
         k, _, _, _, moved = now
         return (k < MAX_ARC_STEPS) & ((k == 0) | jnp.any(moved[k - 1]))
 
@@ -83,7 +87,7 @@ def measure_arc(
     grid: GridSpec,
     hits: Array,
 ) -> tuple[Array, Array, Array]:
-    """Polyline, length and clearance of one link.
+    """Polyline, length and clearance of one arc or frontier.
 
     The polyline runs from the first junction through the cells traced back from the meeting cell,
     in reverse, through that cell, and through the cells of the other side to the second junction.

@@ -13,9 +13,9 @@ from jaxslam.frontend.tangent_circles import (
     FootPoints,
     TangentCircles,
     WallSegments,
-    _one_of,
     foot_cosine,
     foot_points,
+    one_of,
     wall_segments,
 )
 
@@ -33,8 +33,8 @@ class FittedCircles(NamedTuple):
         penetration: (C,) [m] by which the nearest wall cuts into the circle.
         touched: (K, C) bool, the walls that the circle touches.
         feet_real: (C,) bool, no foot is an end made by occlusion or by the field of view.
-        hidden_depth: (C,) [m] by which unseen parts of walls, behind their visible ends, may cut into the
-            circle.
+        hidden_depth: (C,) [m] by which unseen parts of walls, behind their visible ends, may cut
+            into the circle.
     """
 
     centre: Array
@@ -46,8 +46,10 @@ class FittedCircles(NamedTuple):
     hidden_depth: Array
 
 
-def _variance(foot: FootPoints, walls: WallSegments, runs: Segments) -> Array:
-    """Variance (K, C) [m^2] of the distances to the feet: t^T Sigma_foot t, plus `FOOT_VARIANCE_FLOOR`.
+def _variance(foot: FootPoints, walls: WallSegments, segments: Segments) -> Array:
+    """Variance (K, C) [m^2] of the distances to the feet.
+
+    It is t^T Sigma_foot t + `FOOT_VARIANCE_FLOOR`, with t the unit vector to the foot.
 
     A foot inside its segment errs as the fitted line does across itself, a foot at an end as that
     end.
@@ -58,32 +60,35 @@ def _variance(foot: FootPoints, walls: WallSegments, runs: Segments) -> Array:
         xx, xy, yy = cov[:, :1, 0], cov[:, :1, 1], cov[:, 1:, 1]
         return tx * tx * xx + 2 * tx * ty * xy + ty * ty * yy
 
-    centre = (runs.centre[:, :1] - start_x) * along_x + (runs.centre[:, 1:] - start_y) * along_y
+    centre = (segments.centre[:, :1] - start_x) * along_x + (
+        segments.centre[:, 1:] - start_y
+    ) * along_y
     inside = (
-        runs.offset_variance[:, None] + (foot.along - centre) ** 2 * runs.angle_variance[:, None]
+        segments.offset_variance[:, None]
+        + (foot.along - centre) ** 2 * segments.angle_variance[:, None]
     )
-    at_start = toward_end(runs.end_cov[:, 0])
-    at_end = jnp.where(foot.along <= 0.0, at_start, toward_end(runs.end_cov[:, 1]))
+    at_start = toward_end(segments.end_cov[:, 0])
+    at_end = jnp.where(foot.along <= 0.0, at_start, toward_end(segments.end_cov[:, 1]))
     return (
-        jnp.where((foot.along > 0.0) & (foot.along < walls.size), inside, at_end)
+        jnp.where((foot.along > 0.0) & (foot.along < walls.length), inside, at_end)
         + FOOT_VARIANCE_FLOOR
     )
 
 
-def _hidden_depth(x: Array, y: Array, radius: Array, runs: Segments, thick: float) -> Array:
+def _hidden_depth(x: Array, y: Array, radius: Array, segments: Segments, thick: float) -> Array:
     """By how much [m] unseen parts of walls may cut into circles (C,).
 
     Behind an end that occludes what is farther away, the wall may continue along the line of sight
     by its thickness `thick` [m]: the nearest point of that piece to the centre counts.
     """
-    end = runs.ends.reshape(-1, 2)  # (2 K, 2)
+    end = segments.ends.reshape(-1, 2)  # (2 K, 2)
     end_range = jnp.sqrt(jnp.maximum(dot(end, end), 1e-12))[:, None]
     end_x, end_y = end[:, :1], end[:, 1:]
     sight_x, sight_y = end_x / end_range, end_y / end_range
     behind = jnp.clip((x[None] - end_x) * sight_x + (y[None] - end_y) * sight_y, 0.0, thick)
     dx, dy = end_x + behind * sight_x - x[None], end_y + behind * sight_y - y[None]
     distance = jnp.sqrt(jnp.maximum(dx * dx + dy * dy, 1e-12))
-    occludes = (runs.end_occludes & runs.valid[:, None]).reshape(-1, 1)
+    occludes = (segments.end_occludes & segments.valid[:, None]).reshape(-1, 1)
     return jnp.max(jnp.where(occludes, radius[None] - distance, 0.0), axis=0)
 
 
@@ -92,19 +97,22 @@ def _touched(
 ) -> Array:
     """Walls (K, C) bool that circles touch: their own three, and those within the errors.
 
-    A wall whose foot is in about the direction of one of the three (cosine above `MAX_FOOT_COSINE`) is not
-    counted again: it is probably the next segment of the same wall, with a correlated error.
+    A wall whose foot is in about the direction of one of the three (cosine above `MAX_FOOT_COSINE`)
+    is not counted again: it is probably the next segment of the same wall, with a correlated error.
     """
     index = jnp.arange(len(valid), dtype=jnp.int32)[:, None]
     touched = jnp.abs(foot.distance - start.radius[None]) < within * jnp.sqrt(variance)
     cosines = [foot_cosine(foot.toward, wall) for wall in start.walls]
     touched &= jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2]) < MAX_FOOT_COSINE
-    touched |= _one_of(start.walls, index)
+    touched |= one_of(start.walls, index)
     return touched & valid
 
 
+_Three = tuple[Array, Array, Array]
+
+
 def fit_circles(
-    start: TangentCircles, runs: Segments, *, within: float, thick: float
+    start: TangentCircles, segments: Segments, *, within: float, thick: float
 ) -> FittedCircles:
     """Fit circles to all walls that they touch, by weighted least squares.
 
@@ -123,19 +131,19 @@ def fit_circles(
 
     Args:
         start: C circles, through three walls each.
-        runs: K straight segments of the scan: the walls.
+        segments: K straight segments of the scan: the walls.
         within: A wall touches a circle if its distance is within so many standard deviations of
             the radius.
         thick: [m] thickness of walls, by which they may continue unseen behind a visible end.
     """
-    walls, x, y, radius = wall_segments(runs), start.x, start.y, start.radius
+    walls, x, y, radius = wall_segments(segments), start.x, start.y, start.radius
     foot = foot_points(x, y, walls)
-    variance = _variance(foot, walls, runs)
+    variance = _variance(foot, walls, segments)
     touched = _touched(start, foot, variance, walls.valid, within)
     w = lax.stop_gradient(jnp.where(touched, 1.0 / variance, 0.0))
     total = jnp.maximum(jnp.sum(w, axis=0), 1e-9)
 
-    def gauss_newton(now: tuple[Array, Array, Array], _: None):
+    def gauss_newton(now: _Three, _: None) -> tuple[_Three, _Three]:
         x, y, radius = now
         foot = foot_points(x, y, walls)
         (tx, ty), o = foot.toward, jnp.where(touched, foot.distance - radius[None], 0.0)
@@ -154,8 +162,10 @@ def fit_circles(
     (x, y, radius), cov = lax.scan(gauss_newton, (x, y, radius), length=2)
     xx, xy, yy = (c[-1] for c in cov)
     foot = foot_points(x, y, walls)
-    real_end = jnp.where(foot.along <= 0.0, runs.end_is_real[:, :1], runs.end_is_real[:, 1:])
-    real_foot = real_end | ((foot.along > 0.0) & (foot.along < walls.size))
+    real_end = jnp.where(
+        foot.along <= 0.0, segments.end_is_real[:, :1], segments.end_is_real[:, 1:]
+    )
+    real_foot = real_end | ((foot.along > 0.0) & (foot.along < walls.length))
     return FittedCircles(
         centre=jnp.stack([x, y], axis=-1),
         radius=radius,
@@ -163,5 +173,5 @@ def fit_circles(
         penetration=radius - jnp.min(foot.distance, axis=0),
         touched=touched,
         feet_real=jnp.all(real_foot | ~touched, axis=0),
-        hidden_depth=_hidden_depth(x, y, radius, runs, thick),
+        hidden_depth=_hidden_depth(x, y, radius, segments, thick),
     )

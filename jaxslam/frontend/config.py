@@ -1,13 +1,16 @@
-"""Static configuration of the front end."""
+"""Static configuration of the front end, and its check."""
 
+import math
 from typing import NamedTuple
 
-from jaxslam.core.scan import Lidar
-from jaxslam.frontend.features import FeatureSpec
-from jaxslam.frontend.grid import GridSpec
-from jaxslam.frontend.segments import SegmentSpec
+from jaxslam.core.scan import Lidar, check_lidar
+from jaxslam.frontend.features import FeatureSpec, check_feature_spec
+from jaxslam.frontend.grid import GridSpec, check_grid_spec
+from jaxslam.frontend.junctions import BLOCK
+from jaxslam.frontend.segments import SegmentSpec, check_segment_spec
 
 LABELS = ("segments", "codes")
+"""Known sources of the Voronoi diagram, for `FrontendConfig.labels`."""
 
 
 class FrontendConfig(NamedTuple):
@@ -29,3 +32,32 @@ class FrontendConfig(NamedTuple):
     features: FeatureSpec = FeatureSpec()
     labels: str = "segments"
     automaton_steps: int = 32
+
+
+def check_config(config: FrontendConfig) -> None:
+    """Raise ValueError, naming the field, unless the front end can work with a configuration."""
+    if not isinstance(config, FrontendConfig):
+        raise ValueError(f"config is a {type(config).__name__}, not a FrontendConfig")
+    check_lidar(config.lidar)
+    check_grid_spec(config.grid)
+    check_segment_spec(config.segments)
+    check_feature_spec(config.features)
+    max_corners, max_segments = config.features.max_corners, config.segments.max_segments
+    if max_corners > max_segments:
+        raise ValueError(
+            f"features.max_corners is {max_corners}, more than segments.max_segments, "
+            f"{max_segments}"
+        )
+    height, width = config.grid.shape
+    num_blocks = math.ceil(height / BLOCK) * math.ceil(width / BLOCK)
+    if config.features.num_candidates > num_blocks:
+        max_junctions = config.features.max_junctions
+        raise ValueError(
+            f"features.max_junctions is {max_junctions}, too many for a grid of "
+            f"{config.grid.shape} cells"
+        )
+    if config.labels not in LABELS:
+        known = " or ".join(map(repr, LABELS))
+        raise ValueError(f"config.labels is {config.labels!r}, not {known}")
+    if config.automaton_steps < 0:
+        raise ValueError(f"config.automaton_steps is {config.automaton_steps}, not 0 or more")

@@ -2,12 +2,12 @@
 
 import jax.numpy as jnp
 
-from jaxslam.core.types import Array, check_array
+from jaxslam.core.types import Array, as_bool
 from jaxslam.frontend.automaton import neighbours
-from jaxslam.frontend.grid import Grid, GridSpec, centres
+from jaxslam.frontend.grid import Grid, GridSpec, centres, check_grid_spec
 
 # Code of each pattern of occupied neighbours, bits N=1 E=2 S=4 W=8 with the sensor axis to the
-# north; 34 is e3 on the clockwise side of the axis and e4 on the other; 0 is no source.
+# north; `_SIDE` is e3 on the clockwise side of the axis and e4 on the other; 0 is no source.
 _SIDE = 34
 _CODES = (1, _SIDE, 2, 5, _SIDE, _SIDE, 5, 3, 2, 6, 2, 2, 6, 4, 2, 0)
 
@@ -20,8 +20,8 @@ def edge_codes(spec: GridSpec, grid: Grid) -> Array:
     and count as the one they mirror.
 
     Args:
-        grid: The local grid of a scan.
-        spec: Its extent.
+        spec: The extent of the grid.
+        grid: The local grid of a scan; NumPy arrays, lists or JAX arrays.
 
     Raises:
         ValueError: The grid has another shape or type than `spec` says; while tracing.
@@ -29,13 +29,14 @@ def edge_codes(spec: GridSpec, grid: Grid) -> Array:
     References:
         Paper, section 2.2, Figs. 3 to 5.
     """
-    check_array("grid.occupied", grid.occupied, spec.shape, jnp.bool_)
-    north, south, west, east = neighbours(grid.occupied.astype(jnp.uint8))
+    check_grid_spec(spec)
+    occupied = as_bool("grid.occupied", grid.occupied, spec.shape)
+    north, south, west, east = neighbours(occupied.astype(jnp.uint8))
     pattern = north + 2 * east + 4 * south + 8 * west
     code = jnp.array(_CODES, jnp.uint8)[pattern]
     clockwise = centres(spec)[..., 1] < 0.0
     code = jnp.where(code == _SIDE, jnp.where(clockwise, 3, 4).astype(jnp.uint8), code)
-    return jnp.where(grid.occupied, code, 0).astype(jnp.uint8)
+    return jnp.where(occupied, code, 0).astype(jnp.uint8)
 
 
 def edge_code_bits(codes: Array) -> Array:

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jaxslam.core import trace_cache
 from jaxslam.core.batching import map_batches
 from jaxslam.core.features import Features, concatenate_features
-from jaxslam.core.scan import Scan
+from jaxslam.core.scan import Scan, as_scan
 from jaxslam.core.types import Array
 from jaxslam.frontend import automaton, edge_codes, junctions, local_graph, segmentation, voronoi
 from jaxslam.frontend.automaton import Diagram
-from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.config import FrontendConfig, check_config
 from jaxslam.frontend.features import find_corners, find_wall_directions
 from jaxslam.frontend.grid import rasterise, seen_free
 from jaxslam.frontend.local_graph import LocalArcs
@@ -21,48 +21,71 @@ SCAN_BATCH = 16  # scans whose features are extracted together
 
 
 def extract_features(config: FrontendConfig, scan: Scan) -> Features:
-    """Extract the features of one scan, base_link frame."""
-    return extract_diagram(config, scan)[0]
-
-
-def segment_fronts(run: Array, open: Array) -> Array:
-    """Initial cells (H, W) int8 of the automaton, as `automaton.expand_fronts` takes them.
+    """Extract the features of one scan.
 
     Args:
-        run: (H, W) int8 wall segment of each source cell, -1 elsewhere.
-        open: (H, W) bool, cells that fronts may enter.
+        config: Static configuration of the front end.
+        scan: One scan of `config.lidar`, as of `to_scan`; NumPy arrays, lists or JAX arrays.
+
+    Returns:
+        `config.features.max_features` features, padded: junctions, then corners, then wall
+        directions; robot frame.
+
+    Raises:
+        ValueError: The configuration is impossible, or the scan is not one of its scanner; while
+            tracing.
     """
-    empty = jnp.where(open, automaton.EMPTY, automaton.SHUT).astype(jnp.int8)
-    return jnp.where(run >= 0, run, empty)
+    features, _, _ = extract_diagram(config, scan)
+    return features
+
+
+def encode_segments(segment: Array, free: Array) -> Array:
+    """Initial cells (H, W) int8 of the automaton, as `automaton.expand_encoded` takes them.
+
+    Args:
+        segment: (H, W) int8 wall segment of each source cell, -1 elsewhere.
+        free: (H, W) bool, cells that fronts may enter.
+    """
+    empty = jnp.where(free, automaton.EMPTY, automaton.FROZEN).astype(jnp.int8)
+    return jnp.where(segment >= 0, segment, empty)
 
 
 def extract_diagram(config: FrontendConfig, scan: Scan) -> tuple[Features, Diagram, Array]:
-    """Extract the features of one scan.
+    """Extract the features of one scan, and the diagram that they come from.
+
+    Args:
+        config: As of `extract_features`.
+        scan: As of `extract_features`.
 
     Returns:
-        The features (base_link frame), the Voronoi diagram that the junctions come from, and its
+        The features (robot frame), the Voronoi diagram that the junctions come from, and its
         source cells (H, W) bool.
+
+    Raises:
+        ValueError: As of `extract_features`.
 
     References:
         Paper, section 2; `labels="codes"` is its method, with fronts that are diamonds.
     """
+    check_config(config)
+    scan = as_scan(config.lidar, scan)
     lidar, spec = config.lidar, config.grid
     segments = segmentation.find_segments(lidar, config.segments, scan)
     if config.labels == "codes":
         grid = rasterise(lidar, spec, scan)
         labels = edge_codes.edge_code_bits(edge_codes.edge_codes(spec, grid))
-        start = automaton.initial_fronts(labels, grid.free)
+        start = automaton.encode_sources(labels, grid.free)
         sources = grid.occupied
     else:
         segment = segment_cells(lidar, spec, scan, segments)
         sources = segment >= 0
         bit = jnp.uint32(1) << jnp.maximum(segment, 0).astype(jnp.uint32)
         labels = jnp.where(sources, bit, 0)
-        start = segment_fronts(segment, seen_free(lidar, spec, scan))
+        start = encode_segments(segment, seen_free(lidar, spec, scan))
     octagon = config.labels == "segments"
-    fronts = automaton.expand_fronts(start, steps=config.automaton_steps, octagon=octagon)
-    diagram = automaton.diagram_of_fronts(labels, fronts, octagon=octagon)
-    cells = voronoi.junction_cells_of_fronts(fronts, sources)
+    encoded = automaton.expand_encoded(start, steps=config.automaton_steps, octagon=octagon)
+    diagram = automaton.decode(labels, encoded, octagon=octagon)
+    cells = voronoi.encoded_junction_cells(encoded, sources)
     features = concatenate_features(
         junctions.find_junctions(lidar, spec, config.features, cells, scan, segments),
         find_corners(config.features, segments),
@@ -72,16 +95,19 @@ def extract_diagram(config: FrontendConfig, scan: Scan) -> tuple[Features, Diagr
 
 
 def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, LocalArcs]:
-    """Local topological map of one scan: its features, and the arcs between its junctions."""
+    """Local topological map of one scan: its features, and the arcs between its junctions.
+
+    Args:
+        config: As of `extract_features`; at most 31 junctions.
+        scan: As of `extract_features`.
+
+    Raises:
+        ValueError: As of `extract_features`, or there may be more than 31 junctions.
+    """
     features, diagram, sources = extract_diagram(config, scan)
+    scan = as_scan(config.lidar, scan)
     arcs = local_graph.find_local_arcs(
-        config.lidar,
-        config.grid,
-        config.features,
-        features,
-        diagram,
-        sources,
-        scan,
+        config.lidar, config.grid, config.features, features, diagram, sources, scan
     )
     return features, arcs
 

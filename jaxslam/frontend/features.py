@@ -2,12 +2,13 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.core.features import Features, zero_padding
 from jaxslam.core.se2 import cross, dot, unit_vector, wrap_angle, wrap_direction
-from jaxslam.core.types import CORNER, JUNCTION, WALL, Array, check_array
+from jaxslam.core.types import CORNER, JUNCTION, WALL, Array, as_bool, as_float
 from jaxslam.frontend.segments import Segments
 
 
@@ -23,14 +24,14 @@ class FeatureSpec(NamedTuple):
         min_separation: [m] of junctions nearer to each other than this one is kept.
         min_foot_angle: [rad] smallest angle between the feet of a trusted junction, seen from it.
         min_seen_fraction: Smallest fraction of the circle of a trusted junction that was seen.
-        wall_thickness: [m] thickness of walls, by which they may continue unseen behind a visible end.
+        wall_thickness: [m] by which walls may continue unseen behind a visible end.
         max_hidden_depth: [m] by which unseen walls may cut into the circle of a trusted junction.
         min_wall_length: [m] smallest length of a segment whose direction counts.
         min_corner_length: [m] smallest length of the segments of a trusted corner.
         min_corner_angle: [rad] smallest turn between the segments of a corner, and the smallest
             difference of the turn from pi.
-        tangency_gate: Number of standard deviations from the circle of a junction within which a wall
-            touches it.
+        tangency_gate: A wall touches the circle of a junction if it is within so many standard
+            deviations of it.
     """
 
     max_junctions: int = 8
@@ -59,6 +60,15 @@ class FeatureSpec(NamedTuple):
         return self.max_junctions + self.max_corners + self.max_walls
 
 
+def check_feature_spec(spec: FeatureSpec) -> None:
+    """Raise ValueError, naming the field, unless capacities of features are possible."""
+    if not isinstance(spec, FeatureSpec):
+        raise ValueError(f"features is a {type(spec).__name__}, not a FeatureSpec")
+    for name in ("max_junctions", "max_corners", "max_walls"):
+        if getattr(spec, name) < 0:
+            raise ValueError(f"features.{name} is {getattr(spec, name)}, not 0 or more")
+
+
 def _with_next(mask: Array) -> Array:
     """Whether (K,) bool a mask holds for a segment and for the next one."""
     return mask & jnp.roll(mask, -1)
@@ -68,27 +78,27 @@ def find_corners(spec: FeatureSpec, segments: Segments) -> Features:
     """Corners at which two segments meet, the best located first.
 
     A corner c solves n_k . c = n_k . centre_k for its two segments k, which also gives its
-    covariance (both are fields of `Segments`). The free side of a concave corner is narrower than pi,
-    of a convex one wider.
+    covariance (both are fields of `Segments`). The free side of a concave corner is narrower than
+    pi, of a convex one wider.
 
     Args:
-        segments: The straight segments of the scan.
         spec: Capacities and thresholds.
+        segments: The straight segments of the scan.
 
     Returns:
-        `spec.corners` features of kind `CORNER`, trusted ones first; robot frame.
+        `spec.max_corners` features of kind `CORNER`, trusted ones first; robot frame.
     """
     along = segments.tangent
     following = jnp.roll(along, -1, axis=0)
     turn = jnp.arctan2(cross(along, following), dot(along, following))
     xy, cov = segments.ends[:, 1], segments.end_cov[:, 1]
-    good = segments.meets_next & segments.valid & _with_next(segments.count >= 3)
+    good = segments.meets_next & segments.valid & _with_next(segments.num_beams >= 3)
     good &= (jnp.abs(turn) > spec.min_corner_angle) & (
         jnp.abs(turn) < jnp.pi - spec.min_corner_angle
     )
     trace = cov[:, 0, 0] + cov[:, 1, 1]
     good &= trace < 0.02
-    long = (segments.count >= 5) & (segments.length > spec.min_corner_length)
+    long = (segments.num_beams >= 5) & (segments.length > spec.min_corner_length)
     trusted = good & _with_next(long) & (trace < 0.005)
     # A trace is below 1: trusted corners come first.
     rank = jnp.where(good, trace - trusted.astype(trace.dtype), jnp.inf)
@@ -114,23 +124,23 @@ def find_corners(spec: FeatureSpec, segments: Segments) -> Features:
 def find_wall_directions(spec: FeatureSpec, segments: Segments) -> Features:
     """Directions of the walls of a scan: groups of long parallel segments, the longest first.
 
-    A group holds all segments left within 0.1 rad of the longest one; its direction is their mean,
-    weighted by the inverse variances. No two directions need be at right angles: each is a landmark
-    of its own.
+    A group holds all segments, not yet in a group, within 0.1 rad of the longest of them. Its
+    direction is their mean, weighted by the inverse variances. No two directions need be at right
+    angles: each is a landmark of its own.
 
     Args:
-        segments: The straight segments of the scan.
         spec: Capacities and thresholds.
+        segments: The straight segments of the scan.
 
     Returns:
-        `spec.walls` features of kind `WALL`; robot frame.
+        `spec.max_walls` features of kind `WALL`; robot frame.
     """
     angle = jnp.arctan2(segments.tangent[:, 1], segments.tangent[:, 0])
-    long = segments.valid & (segments.length > spec.min_wall_length) & (segments.count >= 8)
+    long = segments.valid & (segments.length > spec.min_wall_length) & (segments.num_beams >= 8)
     precision = 1.0 / segments.angle_variance
     length = jnp.where(long, segments.length, 0.0)
 
-    def next_group(left: Array, _: None):
+    def next_group(left: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
         longest = jnp.argmax(left)
         difference = wrap_direction(angle - angle[longest])
         member = (left > 0.0) & (jnp.abs(difference) < 0.1)
@@ -162,19 +172,22 @@ def features_from_range_bearing(
     """Features of a sensor that measures range and bearing of landmarks itself.
 
     Args:
-        range_bearing: (M, 2) range [m] and bearing [rad], robot frame.
+        range_bearing: (M, 2) range [m] and bearing [rad], robot frame; a NumPy array, list or JAX
+            array, as `valid`.
         valid: (M,) bool, False marks padding.
-        range_std_fraction: Standard deviation of the range as a fraction of the range, on top of the measurement
-            noise that the filter assumes.
+        range_std_fraction: Standard deviation of the range as a fraction of the range, on top of
+            the measurement noise that the filter assumes; not negative.
 
     Returns:
         M features of kind `JUNCTION`, all trusted; robot frame.
 
     Raises:
-        ValueError: An argument has another shape or type; while tracing.
+        ValueError: An argument has another shape, type or range; while tracing.
     """
-    check_array("polar", range_bearing, ("M", 2), jnp.floating)
-    check_array("valid", valid, range_bearing.shape[:1], jnp.bool_)
+    range_bearing = as_float("range_bearing", range_bearing, ("M", 2))
+    valid = as_bool("valid", valid, range_bearing.shape[:1])
+    if not isinstance(range_std_fraction, jax.core.Tracer) and range_std_fraction < 0.0:
+        raise ValueError(f"range_std_fraction is {range_std_fraction}, which is below 0")
     count = valid.size
     zero, none = jnp.zeros(count, range_bearing.dtype), jnp.zeros(count, bool)
     xy = range_bearing[:, :1] * unit_vector(range_bearing[:, 1])

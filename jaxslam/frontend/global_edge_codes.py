@@ -1,13 +1,13 @@
 """Edge codes on a complete global grid: twelve codes, whichever side a wall is seen from.
 
 A scanner sees only the faces that look towards it, so six codes are enough for a scan
-(`edge_codes.edge_codes`). On a global grid every direction occurs, and the method that the paper compares
-itself with has twelve codes.
+(`edge_codes.edge_codes`). On a global grid every direction occurs, and the method that the paper
+compares itself with has twelve codes.
 """
 
 import jax.numpy as jnp
 
-from jaxslam.core.types import Array
+from jaxslam.core.types import Array, as_bool
 from jaxslam.frontend.automaton import neighbours
 
 # Code of each pattern of occupied neighbours, bits N=1 E=2 S=4 W=8, north being the next row and
@@ -24,10 +24,14 @@ def global_edge_codes(occupied: Array) -> Array:
     neighbours two are no edge; here the two ends of a line along one axis share a code, which
     makes twelve of the other fourteen. Turning the grid by 90 degrees permutes the codes.
 
+    Raises:
+        ValueError: `occupied` has another shape or type.
+
     References:
         Paper, section 2.2.
     """
-    north, south, east, west = neighbours(jnp.asarray(occupied).astype(jnp.uint8))
+    occupied = as_bool("occupied", occupied, ("H", "W"))
+    north, south, east, west = neighbours(occupied.astype(jnp.uint8))
     pattern = north + 2 * east + 4 * south + 8 * west
     return jnp.where(occupied, jnp.array(_CODES, jnp.uint8)[pattern], 0).astype(jnp.uint8)
 

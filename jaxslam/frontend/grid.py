@@ -1,11 +1,12 @@
 """Local occupancy grid of one scan: occupied, free and unknown cells (paper, section 2.2)."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.scan import Lidar, Scan, as_scan
 from jaxslam.core.types import Array, check_array
 from jaxslam.frontend.lidar import beam_ends
 
@@ -15,12 +16,12 @@ class GridSpec(NamedTuple):
 
     The robot is at the origin, x points ahead and y to the left:
 
-          y = side    0    -side
-              +-------+-------+       x = ahead, row H - 1
+         y = y_half   0   -y_half
+              +-------+-------+       x = x_max, row H - 1
               |       ^       |
               |       |       |
               +-------R-------+       x = 0
-              +---------------+       x = -behind, row 0
+              +---------------+       x = x_min, row 0
         column W - 1       column 0
 
     Attributes:
@@ -38,9 +39,8 @@ class GridSpec(NamedTuple):
     @property
     def shape(self) -> tuple[int, int]:
         """Number of cells (H, W)."""
-        return round((self.x_max - self.x_min) / self.cell_size), round(
-            2 * self.y_half / self.cell_size
-        )
+        height = round((self.x_max - self.x_min) / self.cell_size)
+        return height, round(2 * self.y_half / self.cell_size)
 
 
 class Grid(NamedTuple):
@@ -53,6 +53,18 @@ class Grid(NamedTuple):
 
     occupied: Array
     free: Array
+
+
+def check_grid_spec(spec: GridSpec) -> None:
+    """Raise ValueError, naming the field, unless the grid has a positive extent and cells."""
+    if not isinstance(spec, GridSpec):
+        raise ValueError(f"grid is a {type(spec).__name__}, not a GridSpec")
+    if not all(math.isfinite(value) for value in spec):
+        raise ValueError(f"grid is {spec}, not of finite numbers")
+    if not spec.cell_size > 0.0:
+        raise ValueError(f"grid.cell_size is {spec.cell_size}, not above 0")
+    if min(spec.shape) < 1:
+        raise ValueError(f"grid is {spec}, which has {spec.shape} cells")
 
 
 def grid_origin(spec: GridSpec) -> np.ndarray:
@@ -89,9 +101,9 @@ def seen_free(lidar: Lidar, spec: GridSpec, scan: Scan) -> Array:
     """Free cells (H, W) bool: both beams beside the centre of the cell end further away.
 
     Args:
-        scan: The scan.
-        lidar: Its scanner.
+        lidar: The scanner.
         spec: The grid.
+        scan: The scan.
 
     Raises:
         ValueError: The ranges are not those of one scan of this lidar; while tracing.
@@ -119,14 +131,16 @@ def rasterise(lidar: Lidar, spec: GridSpec, scan: Scan) -> Grid:
     of the beam, along both where their ratio is at least one half; it never covers a free cell.
 
     Args:
-        scan: The scan.
-        lidar: Its scanner.
+        lidar: The scanner.
         spec: The grid.
+        scan: The scan; NumPy arrays, lists or JAX arrays.
 
     Raises:
-        ValueError: Ranges or hits are not those of one scan of this lidar; while tracing.
+        ValueError: Scanner or grid are impossible, or ranges or hits are not those of one scan of
+            this lidar; while tracing.
     """
-    check_array("scan.hit", scan.hit, (lidar.num_beams,), jnp.bool_)
+    check_grid_spec(spec)
+    scan = as_scan(lidar, scan)
     xy = beam_ends(lidar, scan)
     outside = jnp.array(spec.shape, jnp.int32)[None]
     index = jnp.where(scan.hit[:, None], cell_of(spec, xy), outside)

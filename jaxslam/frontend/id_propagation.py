@@ -22,7 +22,7 @@ def id_bits(count: int) -> Array:
     for bits in (8, 16, 32):
         if count < bits:
             return jnp.asarray(2 ** np.arange(count + 1, dtype=np.int64), f"uint{bits}")
-    raise ValueError(f"spec.nodes is {count}: at most 31 junctions can be linked")
+    raise ValueError(f"features.max_junctions is {count}, more than the 31 that arcs can join")
 
 
 class PropagatedIds(NamedTuple):
@@ -46,6 +46,11 @@ def propagate_ids(seeds: Array, diagram: Diagram, sources: Array) -> PropagatedI
     """Propagate ids from their seeds (H, W) along the branches of a diagram.
 
     The branches are widened to three cells, so that a gap of one cell does not cut them.
+
+    Args:
+        seeds: (H, W) bit sets of ids, of `seed_cells`.
+        diagram: The Voronoi diagram.
+        sources: (H, W) bool, the cells that fronts started from.
     """
     branch = branch_cells(diagram, sources)
     band = (block_union(branch.astype(jnp.uint8)) > 0) & (diagram.labels != 0) & ~sources

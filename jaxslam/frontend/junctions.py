@@ -63,7 +63,7 @@ def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Arr
     return jnp.stack([flat // width, flat % width], axis=-1), top > 0.0
 
 
-def _seen_fraction(centre: Array, radius: Array, scan: Scan, lidar: Lidar) -> tuple[Array, Array]:
+def _seen_fraction(lidar: Lidar, centre: Array, radius: Array, scan: Scan) -> tuple[Array, Array]:
     """Fraction (C,) of the area of circles that was seen, and whether (C,) the whole disc was.
 
     The visible region is star-shaped around the robot, so it contains a disc if it contains the
@@ -78,15 +78,15 @@ def _seen_fraction(centre: Array, radius: Array, scan: Scan, lidar: Lidar) -> tu
     return area, jnp.all(seen[:, -1], axis=1)
 
 
-def _best_apart(score: Array, xy: Array, apart: float, count: int) -> tuple[Array, Array]:
-    """The best of N points that are at least `apart` from each other: non-maximum suppression.
+def _best_apart(score: Array, xy: Array, min_distance: float, count: int) -> tuple[Array, Array]:
+    """The best of N points at least `min_distance` from each other: non-maximum suppression.
 
-    A point is suppressed by a better one nearer than `apart`.
+    A point is suppressed by a better one nearer than `min_distance`.
 
     Args:
         score: (N,) larger is better; 0 or less excludes a point.
         xy: (N, 2) [m].
-        apart: [m].
+        min_distance: [m].
         count: Number of points wanted.
 
     Returns:
@@ -96,7 +96,7 @@ def _best_apart(score: Array, xy: Array, apart: float, count: int) -> tuple[Arra
     xy, good = xy[order], score[order] > 0.0
     gap = jnp.linalg.norm(xy[:, None] - xy[None], axis=2)
     better = jnp.tril(jnp.ones(gap.shape, bool), -1)
-    good &= ~jnp.any(better & good[None, :] & (gap < apart), axis=1)
+    good &= ~jnp.any(better & good[None, :] & (gap < min_distance), axis=1)
     best = jnp.argsort(~good, stable=True)[:count]
     return order[best], good[best]
 
@@ -117,6 +117,10 @@ def _neighbours(circle: TangentCircles) -> tuple[Array, Array, Array]:
     return jnp.repeat(circle.x, 3), jnp.repeat(circle.y, 3), three
 
 
+_Start = tuple[Array, Array, Array, Array]
+"""Initial centres x and y (C,), walls (3, C), and whether there is one (C,), of C circles."""
+
+
 def _tangent_circles(
     cells: Array, walls: WallSegments, grid: GridSpec, spec: FeatureSpec, dtype: jnp.dtype
 ) -> tuple[TangentCircles, Array]:
@@ -128,7 +132,7 @@ def _tangent_circles(
                   drop circles that a wall cuts, whose feet are close together, or that moved > 1 m;
                   score = smallest angle between two feet;  suppress duplicates
 
-    Both rounds have C = 3 N circles, with N = `spec.nodes`, so they are one scanned program.
+    Both rounds have C = 3 N circles, N = `spec.max_junctions`, so they are one scanned program.
 
     Returns:
         The best 2 N circles of both rounds, best first, and whether there is one: (2 N,) bool.
@@ -136,10 +140,10 @@ def _tangent_circles(
     index, found = _nearest_cells(cells, grid, spec.num_candidates)
     xy = centre_of(grid, index).astype(dtype)
     x, y = xy[:, 0], xy[:, 1]
-    alike = math.cos(0.7 * spec.min_foot_angle)
-    three = nearest_three_walls(foot_points(x, y, walls), alike)
+    max_cosine = math.cos(0.7 * spec.min_foot_angle)
+    three = nearest_three_walls(foot_points(x, y, walls), max_cosine)
 
-    def search(start: tuple[Array, Array, Array, Array], _: None):
+    def search(start: _Start, _: None) -> tuple[_Start, tuple[TangentCircles, Array]]:
         x, y, three, found = start
         circle = tangent_circles(x, y, three, walls, swaps=3)
         moved = jnp.hypot(circle.x - x, circle.y - y)
@@ -198,22 +202,22 @@ def find_junctions(
     differ, and every foot is real: no foot is an end made by occlusion or by the field of view.
 
     Args:
-        cells: (H, W) bool, the junction cells.
-        scan: The scan.
-        segments: Its straight segments.
         lidar: The scanner.
         grid: The grid of `cells`.
         spec: Capacities and limits.
+        cells: (H, W) bool, the junction cells.
+        scan: The scan.
+        segments: Its straight segments.
 
     Returns:
-        `spec.nodes` features of kind `JUNCTION`, trusted ones first; robot frame.
+        `spec.max_junctions` features of kind `JUNCTION`, trusted ones first; robot frame.
     """
     dtype = scan.ranges.dtype
     tangent, found = _tangent_circles(cells, wall_segments(segments), grid, spec, dtype)
     circle = fit_circles(tangent, segments, within=spec.tangency_gate, thick=spec.wall_thickness)
     trace = jnp.trace(circle.cov, axis1=1, axis2=2)
     good = found & _is_junction(circle, trace, scan, lidar, spec)
-    area, certified = _seen_fraction(circle.centre, circle.radius, scan, lidar)
+    area, certified = _seen_fraction(lidar, circle.centre, circle.radius, scan)
     trusted = (
         good
         & (area > spec.min_seen_fraction)

@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
-from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import unit_vector
-from jaxslam.core.types import Array, check_array
+from jaxslam.core.types import Array, as_float
 
 
 def beam_angles(lidar: Lidar) -> Array:
@@ -15,20 +15,26 @@ def beam_angles(lidar: Lidar) -> Array:
 def beam_ends(lidar: Lidar, scan: Scan) -> Array:
     """Ends (R, 2) [m] of the beams in the robot frame.
 
+    Args:
+        lidar: The scanner.
+        scan: One of its scans; NumPy arrays, lists or JAX arrays.
+
     Raises:
-        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+        ValueError: The scanner is impossible, or the ranges are not those of one of its scans;
+            while tracing.
     """
-    check_array("scan.ranges", scan.ranges, (lidar.num_beams,), jnp.floating)
-    return scan.ranges[:, None] * unit_vector(beam_angles(lidar))
+    check_lidar(lidar)
+    ranges = as_float("scan.ranges", scan.ranges, (lidar.num_beams,))
+    return ranges[:, None] * unit_vector(beam_angles(lidar))
 
 
 def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
     """Whether points lie before the ends of the two beams on either side: in the visible region.
 
     Args:
+        lidar: The scanner; points outside its field of view are not visible.
         points: (..., 2) [m] points, robot frame.
         ranges: (R,) [m] of the beams.
-        lidar: The scanner; points outside its field of view are not visible.
 
     Returns:
         (...) bool.
@@ -40,12 +46,19 @@ def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
 
 
 def to_scan(lidar: Lidar, ranges: Array) -> Scan:
-    """Scans of raw ranges (..., R) [m]; NaN, infinite or beyond the largest range is no return.
+    """A scan, or scans, of raw ranges.
+
+    Args:
+        lidar: The scanner.
+        ranges: (..., R) [m], a NumPy array, list or JAX array; what is NaN, infinite, not above
+            zero or not below `lidar.range_max` is no return.
 
     Raises:
-        ValueError: The ranges are not those of this lidar's beams; while tracing.
+        ValueError: The scanner is impossible, or the ranges are not those of its beams; while
+            tracing.
     """
-    check_array("ranges", ranges, (..., lidar.num_beams), jnp.floating)
+    check_lidar(lidar)
+    ranges = as_float("ranges", ranges, (..., lidar.num_beams))
     hit = (ranges > 0.0) & (ranges < lidar.range_max)  # NaN compares false
     return Scan(ranges=jnp.where(hit, ranges, lidar.range_max), hit=hit)
 

@@ -1,4 +1,4 @@
-"""Straight pieces of a laser scan: optimal partitioning of its beams, and moments of line fits."""
+"""Optimal partition of the beams of a scan into straight segments, and moments of line fits."""
 
 from typing import NamedTuple
 
@@ -31,9 +31,9 @@ class BeamIntervals(NamedTuple):
         """Number (K,) int32 of their beams."""
         return jnp.maximum(self.last - self.first + 1, 0)
 
-    def interval_of_beam(self, beams: int) -> Array:
+    def interval_of_beam(self, num_beams: int) -> Array:
         """Index (R,) int32 of the interval that each beam is in, K for none."""
-        beam = jnp.arange(beams, dtype=jnp.int32)[None]
+        beam = jnp.arange(num_beams, dtype=jnp.int32)[None]
         slot = jnp.arange(self.first.size, dtype=jnp.int32)[:, None]
         member = (self.first[:, None] <= beam) & (beam <= self.last[:, None])
         return jnp.min(jnp.where(member, slot, self.first.size), axis=0)
@@ -56,8 +56,8 @@ class Moments(NamedTuple):
 class LineCandidates(NamedTuple):
     """Candidates for the last segment up to the present beam, with their lines; leading axis C.
 
-    Each lane is one choice of the segment's first beam. Its line is 1 / r = a cos(t) + b sin(t),
-    where t is the bearing from that first beam; see `partition_beams`.
+    Each candidate is one choice of the segment's first beam. Its line is
+    1 / r = a cos(t) + b sin(t), where t is the bearing from that first beam; see `partition_beams`.
 
     Attributes:
         cost: (C,) of the best partition up to the present beam that ends in this segment.
@@ -84,6 +84,11 @@ class Partition(NamedTuple):
 
     begins: Array
     normal: Array
+
+
+_Pair = tuple[Array, Array]
+_Carry = tuple[LineCandidates, Array, Array]
+"""Candidates, the least of their costs (), and index of the one that costs most ()."""
 
 
 def partition_beams(
@@ -121,20 +126,21 @@ def partition_beams(
 
     Partition. With F(j) the least cost of beams 0..j and C(i, j) the cost of the line of i..j,
 
-        F(-1) = 0,    F(j) = min over i <= j of F(i - 1) + price + C(i, j)
+        F(-1) = 0,    F(j) = min over i <= j of F(i - 1) + segment_cost + C(i, j)
 
-    A lane holds one i, and its cost is the term under the minimum. At each beam all lanes take the
-    beam in, and a new one starts with i = j. To bound their number, it replaces the one that cost
-    most after the beam before; with as many lanes as beams the partition is optimal. From the best
-    i of each beam the first beams of the segments follow backwards (`_backtrack`).
+    A candidate holds one i, and its cost is the term under the minimum. At each beam all candidates
+    take the beam in, and a new one starts with i = j. To bound their number, it replaces the one
+    that cost most after the beam before; with as many candidates as beams the partition is optimal.
+    From the best i of each beam the first beams of the segments follow backwards (`_backtrack`).
 
     Args:
+        lidar: The scanner.
         scan: The scan.
         breaks: (R,) bool, a segment must begin at this beam.
-        lidar: The scanner.
         range_std: [m] standard deviation of a range.
         segment_cost: Cost of a segment, in squared standard deviations.
-        outlier_cost: Bound of the cost of one beam; a beam that reaches it does not change the line.
+        outlier_cost: Bound of the cost of one beam; a beam that reaches it does not change the
+            line.
         num_candidates: C, number of candidates that are kept.
         roughness_std: [m] standard deviation of the wall about its line.
         roughness_length: [m] length of wall over which that deviation is the same.
@@ -148,19 +154,19 @@ def partition_beams(
     q = 1.0 / jnp.maximum(scan.ranges, 0.02)
     beam = jnp.arange(lidar.num_beams, dtype=jnp.int32)
     ray = unit_vector(beam_angles(lidar)).astype(q.dtype)
-    lane = jnp.arange(num_candidates, dtype=jnp.int32)
+    candidate = jnp.arange(num_candidates, dtype=jnp.int32)
 
     def variance(q: Array, foot: Array) -> Array:
         """Variance [1/m^2] of q = 1 / r on a line whose foot has the inverse distance `foot`.
 
         A range error e changes q by -q^2 e, an offset e of the wall by -q foot e. The offset is
-        the same for the grain q^2 / (step foot) beams that hit one grain, so that one beam counts
-        the less, the more of them there are.
+        the same for all roughness_length q^2 / (angle_increment foot) beams that hit one piece of
+        wall of `roughness_length`, so that one beam counts the less, the more of them there are.
         """
         wall = foot * jnp.maximum(foot, roughness_length / lidar.angle_increment * q * q)
         return q * q * ((range_std * q) ** 2 + roughness_std**2 * wall)
 
-    def step(carry: tuple[LineCandidates, Array, Array], observed: tuple):
+    def step(carry: _Carry, observed: tuple[Array, ...]) -> tuple[_Carry, tuple[Array, _Pair]]:
         old, least_cost, worst = carry
         index, q, cosine, sine, must_begin = observed
         foot = jnp.sqrt(old.line[0] ** 2 + old.line[1] ** 2)
@@ -171,36 +177,36 @@ def partition_beams(
         begun = LineCandidates(
             least_cost + segment_cost, index, (cosine, sine), (q, zero), prior_cov
         )
-        new = jax.tree.map(lambda x, y: jnp.where(lane == worst, x, y), begun, extended)
+        new = jax.tree.map(lambda x, y: jnp.where(candidate == worst, x, y), begun, extended)
         best, worst = jnp.argmin(new.cost), jnp.argmax(new.cost).astype(jnp.int32)
         (cos0, sin0), (a, b) = jax.tree.map(lambda x: x[best], (new.heading, new.line))
         normal = cos0 * a - sin0 * b, sin0 * a + cos0 * b  # (a, b) turned to the robot frame
         return (new, new.cost[best], worst), (new.first[best], normal)
 
     zero, one = jnp.zeros(num_candidates, q.dtype), jnp.ones(num_candidates, q.dtype)
-    unused = LineCandidates(one * jnp.inf, lane, (one, zero), (zero, zero), (one, zero, one))
+    unused = LineCandidates(one * jnp.inf, candidate, (one, zero), (zero, zero), (one, zero, one))
     must_begin = breaks | ~scan.hit
     start = unused, jnp.zeros((), q.dtype), jnp.int32(0)
     _, (first, normal) = lax.scan(step, start, (beam, q, ray[:, 0], ray[:, 1], must_begin))
-    normal = jnp.stack(normal, axis=1)
-    size = jnp.sqrt(jnp.maximum(dot(normal, normal), 1e-12))
-    return Partition(_backtrack(beam, first), normal / size[:, None])
+    normals = jnp.stack(normal, axis=1)
+    size = jnp.sqrt(jnp.maximum(dot(normals, normals), 1e-12))
+    return Partition(_backtrack(beam, first), normals / size[:, None])
 
 
 def _add_beam(
-    lanes: LineCandidates, q: Array, ray: tuple[Array, Array], variance: Array, outlier: float
+    candidates: LineCandidates, q: Array, ray: tuple[Array, Array], variance: Array, outlier: float
 ) -> LineCandidates:
-    """Extend all segments by one beam: a step of recursive least squares, see `partition_beams`.
+    """Extend all candidates by one beam: a step of recursive least squares (`partition_beams`).
 
     Args:
-        lanes: The segments up to the beam before.
+        candidates: The candidates up to the beam before.
         q: [1/m] inverse range of the beam.
         ray: Cosine and sine of its bearing.
         variance: (C,) [1/m^2] of q, on the line of each.
         outlier: Squared standard deviations from which on the beam does not change a line.
     """
-    (cosine, sine), (cos0, sin0) = ray, lanes.heading
-    (a, b), (aa, ab, bb) = lanes.line, lanes.cov
+    (cosine, sine), (cos0, sin0) = ray, candidates.heading
+    (a, b), (aa, ab, bb) = candidates.line, candidates.cov
     # h = (cos t, sin t), and P h'.
     cos_t, sin_t = cosine * cos0 + sine * sin0, sine * cos0 - cosine * sin0
     cov_a, cov_b = aa * cos_t + ab * sin_t, ab * cos_t + bb * sin_t
@@ -209,9 +215,9 @@ def _add_beam(
     squared = innovation * innovation / total
     inverse = jnp.where(squared < outlier, 1.0 / total, 0.0)
     return LineCandidates(
-        cost=lanes.cost + jnp.minimum(squared, outlier),
-        first=lanes.first,
-        heading=lanes.heading,
+        cost=candidates.cost + jnp.minimum(squared, outlier),
+        first=candidates.first,
+        heading=candidates.heading,
         line=(a + cov_a * inverse * innovation, b + cov_b * inverse * innovation),
         cov=(
             aa - cov_a * inverse * cov_a,
@@ -229,7 +235,7 @@ def _backtrack(beam: Array, first: Array) -> Array:
         first: (R,) int32 first beam of the last segment of the best partition up to each beam.
     """
 
-    def step(segment_first: Array, here: tuple[Array, Array]):
+    def step(segment_first: Array, here: tuple[Array, Array]) -> tuple[Array, Array]:
         index, first_before = here
         begins = index == segment_first
         return jnp.where(begins, first_before, segment_first), begins
@@ -245,10 +251,10 @@ def longest_intervals(begins: Array, hit: Array, *, capacity: int) -> BeamInterv
         hit: (R,) bool, the beam returned; segments of beams that did not are left out.
         capacity: K.
     """
-    beams = hit.size
-    beam = jnp.arange(beams, dtype=jnp.int32)
-    next_first = lax.cummin(jnp.where(begins, beam, beams), reverse=True)
-    last = jnp.append(next_first[1:], beams) - 1
+    num_beams = hit.size
+    beam = jnp.arange(num_beams, dtype=jnp.int32)
+    next_first = lax.cummin(jnp.where(begins, beam, num_beams), reverse=True)
+    last = jnp.append(next_first[1:], num_beams) - 1
     size, index = lax.top_k(jnp.where(begins & hit, last - beam + 1, 0), capacity)
     first = jnp.sort(jnp.where(size > 0, index, NO_BEAM))
     return BeamIntervals(first, last.at[first].get(mode="fill", fill_value=-1))

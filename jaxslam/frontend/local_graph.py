@@ -1,16 +1,16 @@
 """Local topological map of one scan: which junctions the Voronoi branches join, and how.
 
-The ids of the junctions propagate along the branches, by the same automaton as the fronts that grew
-the diagram. Where two ids meet there is a link; where an id comes to the end of the visible region,
-a frontier. The arrival steps lead back from there to the junctions, which gives the polyline:
+The ids of the junctions propagate along the branches, by the same automaton that grew the diagram.
+Where two ids meet there is an arc; where an id comes to the end of the visible region, a frontier.
+The arrival steps lead back from there to the junctions, which gives the polyline:
 
     junction 1                                          junction 2
         o 1 1 1 1 1 1 1 1 1 1 1 # 2 2 2 2 2 2 2 2 2 2 2 2 o        ids; # holds both: they met
         0 1 2 3 4 5 6 7 8 9 ... 12 ...  9 8 7 6 5 4 3 2 1 0        steps of arrival
         <------- back ------------ # ------------- back -->        `trace_back`
 
-Stages: `seed_cells` and `propagate_ids` (ids), `_meets` and `_ends` (where to start back-tracing),
-`trace_back` (cells), `measure_arc` (polyline, length, clearance).
+Stages: `seed_cells` and `propagate_ids` (ids), `_meeting_cells` and `_end_cells` (where to start
+back-tracing), `trace_back` (cells), `measure_arc` (polyline, length, clearance).
 """
 
 from collections.abc import Callable
@@ -25,10 +25,10 @@ from jax import lax
 from jaxslam.core.batching import sequential_vmap_on_cpu
 from jaxslam.core.features import Features
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import Array
+from jaxslam.core.types import Array, check_array
 from jaxslam.frontend import automaton
 from jaxslam.frontend.arc_tracing import measure_arc, trace_back
-from jaxslam.frontend.automaton import Diagram, single_label
+from jaxslam.frontend.automaton import Diagram, single_labels
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, seen_free
 from jaxslam.frontend.id_propagation import PropagatedIds, id_bits, propagate_ids, seed_cells
@@ -36,9 +36,9 @@ from jaxslam.frontend.lidar import beam_ends
 
 MAX_LOCAL_ARCS, MAX_LOCAL_FRONTIERS = 12, 6  # capacities of a scan
 MAX_MEETING_CELLS = 512  # capacity for cells in which ids meet, or branches end
-SAME_ARC_DISTANCE = (
-    0.6  # [m] links with the same ends, farther apart than this somewhere, are two links
-)
+
+SAME_ARC_DISTANCE = 0.6
+"""[m] Arcs with the same ends are two arcs if they are farther apart than this somewhere."""
 
 
 class LocalArcs(NamedTuple):
@@ -47,7 +47,8 @@ class LocalArcs(NamedTuple):
     Attributes:
         pair: (P, 2) int32 features that they join, the smaller index first; the second is -1 for a
             frontier.
-        polyline: (P, K, 2) [m] points at equal distances, from the first end to the second.
+        polyline: (P, `POLYLINE_POINTS`, 2) [m] points at equal distances, from the first end to
+            the second.
         length: (P,) [m] along the branch.
         clearance: (P,) [m] smallest along the branch, both ends included.
         valid: (P,) bool, False marks padding.
@@ -66,7 +67,9 @@ def polyline_gap(one: Array, other: Array) -> Array:
 
 
 def repeats_earlier(pair: Array, line: Array, valid: Array) -> Array:
-    """Whether links are duplicates of an earlier one: same ends, and less than `SAME_ARC_DISTANCE` apart.
+    """Whether arcs are duplicates of an earlier one.
+
+    They have the same ends and are nowhere `SAME_ARC_DISTANCE` apart.
 
     Args:
         pair: (P, 2) int32 ends.
@@ -84,33 +87,32 @@ def repeats_earlier(pair: Array, line: Array, valid: Array) -> Array:
 
 
 def _check(
-    found: Features,
-    diagram: Diagram,
-    sources: Array,
-    scan: Scan,
     lidar: Lidar,
     grid: GridSpec,
     spec: FeatureSpec,
+    features: Features,
+    diagram: Diagram,
+    sources: Array,
+    scan: Scan,
 ) -> None:
     """Raise ValueError if shapes or types do not match."""
-    if scan.ranges.shape != (lidar.num_beams,):
-        raise ValueError(f"scan.ranges is {scan.ranges.shape}, not {(lidar.num_beams,)}")
-    if found.xy.ndim != 2 or found.xy.shape[0] < spec.max_junctions or found.xy.shape[1] != 2:
-        raise ValueError(f"found.xy is {found.xy.shape}, not (M >= {spec.max_junctions}, 2)")
-    for name, cells in (("diagram.labels", diagram.labels), ("sources", sources)):
-        if cells.shape != grid.shape:
-            raise ValueError(f"{name} is {cells.shape}, not as the grid {grid.shape}")
-    if sources.dtype != bool:
-        raise ValueError(f"sources is {sources.dtype}, not bool")
+    check_array("scan.ranges", scan.ranges, (lidar.num_beams,), jnp.floating)
+    check_array("features.xy", features.xy, ("M", 2), jnp.floating)
+    if len(features.xy) < spec.max_junctions:
+        raise ValueError(f"features.xy is {features.xy.shape}, not (M >= {spec.max_junctions}, 2)")
+    check_array("diagram.labels", diagram.labels, grid.shape, jnp.unsignedinteger)
+    check_array("sources", sources, grid.shape, jnp.bool_)
 
 
 def _marked(mask: Array) -> Array:
-    """Flat index (MEETS,) int32 of the first True cells of a mask (H, W); H W is padding."""
+    """Flat index (C,) int32 of the first True cells of a mask (H, W); H W is padding.
+
+    C is `MAX_MEETING_CELLS`, or H W if that is less.
+    """
     # Flat indices are exact in float32. `top_k` takes half the time of `nonzero`.
     first = -jnp.arange(mask.size, dtype=jnp.float32)
-    score, cell = lax.top_k(
-        jnp.where(mask.reshape(-1), first, -jnp.inf), min(MAX_MEETING_CELLS, mask.size)
-    )
+    count = min(MAX_MEETING_CELLS, mask.size)
+    score, cell = lax.top_k(jnp.where(mask.reshape(-1), first, -jnp.inf), count)
     return jnp.where(score > -jnp.inf, cell, mask.size).astype(jnp.int32)
 
 
@@ -132,16 +134,16 @@ def _window(padded: Array, combine: Callable, radius: int) -> Array:
     return padded
 
 
-def _best_apart(
-    score: Array, cells: Array, count: int, apart: int, width: int
+def _best_cells(
+    score: Array, cells: Array, count: int, min_distance: int, width: int
 ) -> tuple[Array, Array]:
-    """The best cells that are at least `apart` cells from each other, taken greedily.
+    """The best cells that are at least `min_distance` cells from each other, taken greedily.
 
     Args:
         score: (C,) larger is better; -inf excludes a cell.
         cells: (C,) int32 flat index.
         count: Number of cells wanted.
-        apart: [cells]
+        min_distance: [cells]
         width: Columns of the grid.
 
     Returns:
@@ -152,7 +154,10 @@ def _best_apart(
         # The first of the largest: two plain reductions are many times as fast as `argmax`.
         best = jnp.min(jnp.where(left == jnp.max(left), index, index.size - 1))
         square = (rows - rows[best]) ** 2 + (columns - columns[best]) ** 2
-        return jnp.where(square < apart**2, -jnp.inf, left), (cells[best], left[best] > -jnp.inf)
+        return jnp.where(square < min_distance**2, -jnp.inf, left), (
+            cells[best],
+            left[best] > -jnp.inf,
+        )
 
     rows, columns = cells // width, cells % width
     index = jnp.arange(cells.size, dtype=jnp.int32)
@@ -170,25 +175,26 @@ def find_local_arcs(
 ) -> LocalArcs:
     """Which junctions the branches of a diagram join, and which branches leave the visible region.
 
-    Two junctions may have two links, if these are `SAME_ARC_DISTANCE` apart somewhere. A frontier is the end of
-    a branch at which it borders on unseen cells, not in a corner, before it meets another junction.
+    Two junctions may have two arcs, if these are `SAME_ARC_DISTANCE` apart somewhere. A frontier is
+    the end of a branch at which it borders on unseen cells, not in a corner, before it meets
+    another junction.
 
     Args:
-        features: Features of the scan, junctions first.
-        diagram: Its Voronoi diagram.
-        sources: (H, W) bool, the cells the fronts came from.
-        scan: The scan.
         lidar: The scanner.
         grid: The grid of the diagram.
         spec: Capacities; at most 31 junctions.
+        features: Features of the scan, junctions first.
+        diagram: Its Voronoi diagram.
+        sources: (H, W) bool, the cells that fronts started from.
+        scan: The scan.
 
     Returns:
-        `MAX_LOCAL_ARCS` links, then `MAX_LOCAL_FRONTIERS` frontiers; robot frame.
+        `MAX_LOCAL_ARCS` arcs, then `MAX_LOCAL_FRONTIERS` frontiers; robot frame.
 
     Raises:
         ValueError: Shapes do not match, or there are too many junctions; while tracing.
     """
-    _check(features, diagram, sources, scan, lidar, grid, spec)
+    _check(lidar, grid, spec, features, diagram, sources, scan)
     xy, valid = features.xy[: spec.max_junctions], features.valid[: spec.max_junctions]
     xy = jnp.where(valid[:, None], xy, 0.0)
     bit = id_bits(spec.max_junctions)
@@ -196,19 +202,17 @@ def find_local_arcs(
     ids = sequential_vmap_on_cpu(propagate_ids)(seeds, diagram, sources)
     free = sequential_vmap_on_cpu(lambda scan: seen_free(lidar, grid, scan))(scan)
     unseen = (diagram.labels == 0) & ~sources & ~free
-    wide = diagram.arrival > round(
-        spec.min_clearance / grid.cell_size
-    )  # steps <= cells to the nearest wall
+    # The step of arrival is at most the distance to the nearest wall in cells.
+    wide = diagram.arrival > round(spec.min_clearance / grid.cell_size)
     apart = round(SAME_ARC_DISTANCE / grid.cell_size)
-    ends = [_meets(ids, xy, grid, bit, apart), _ends(ids, unseen, wide, bit, apart)]
+    ends = [_meeting_cells(ids, xy, grid, bit, apart), _end_cells(ids, unseen, wide, bit, apart)]
     pair, cell, good = (jnp.concatenate(x) for x in zip(*ends, strict=True))
     hits = jnp.where(scan.hit[:, None], beam_ends(lidar, scan), 1e3)
     line, length, clearance = jax.vmap(measure_arc, in_axes=(0, 0, 0, None, None, None))(
         pair, cell, sequential_vmap_on_cpu(trace_back)(pair, cell, ids, bit), xy, grid, hits
     )
-    radius = jnp.append(
-        features.descriptor[: spec.max_junctions], jnp.inf
-    )  # index -1, a frontier, has none
+    # The last entry is for index -1: a frontier, which has no radius.
+    radius = jnp.append(features.descriptor[: spec.max_junctions], jnp.inf)
     clearance = jnp.minimum(clearance, jnp.min(radius[pair], axis=1))
     good &= (pair[:, 1] >= 0) | (clearance > spec.min_clearance)
     good &= ~repeats_earlier(pair, line, good)
@@ -221,21 +225,21 @@ def _meeting_ids(ids: Array) -> Array:
     Between two junctions an even number of steps apart no cell holds both ids: one holds the first,
     its neighbour the second.
     """
-    alone = single_label(ids)
+    alone = single_labels(ids)
     beside = reduce(jnp.bitwise_or, automaton.neighbours(alone))
     return ids | jnp.where(alone != 0, beside, jnp.zeros_like(beside))
 
 
-def _meets(
-    ids: PropagatedIds, xy: Array, grid: GridSpec, bit: Array, apart: int
+def _meeting_cells(
+    ids: PropagatedIds, xy: Array, grid: GridSpec, bit: Array, min_distance: int
 ) -> tuple[Array, Array, Array]:
-    """Where two ids meet first; each pair in two cells at most, `apart` cells from each other.
+    """Where two ids meet first; each pair in two cells at most, `min_distance` cells apart.
 
     Of the cells that hold both ids of a pair those with the earliest step are taken, which a cell
     off the branch is 2.5 steps behind; the distances to both junctions break ties.
 
     Returns:
-        Pairs (LINKS, 2) of ids, cells (LINKS,), and whether there is one: (LINKS,) bool.
+        Pairs (P, 2) of ids, cells (P,) and whether there is one (P,) bool, P = `MAX_LOCAL_ARCS`.
     """
     meeting = _meeting_ids(ids.ids)
     # Few cells hold two ids: all that follows is computed for these only.
@@ -249,20 +253,19 @@ def _meets(
     earliness = -(packed // 2).astype(xy.dtype) - off_branch
     held, width = take(meeting), grid.shape[1]
     centre = centre_of(grid, jnp.stack([cells // width, cells % width], axis=-1))
-    distance = jnp.linalg.norm(centre.astype(xy.dtype)[None] - xy[:, None], axis=-1)  # (N, MEETS)
+    distance = jnp.linalg.norm(centre.astype(xy.dtype)[None] - xy[:, None], axis=-1)  # (N, C)
     first, second = (jnp.asarray(k, jnp.int32) for k in np.triu_indices(len(bit) - 1, 1))
 
     def best_of_pair(i: Array, j: Array) -> tuple[Array, Array]:
         both = bit[i] | bit[j]
         score = earliness - 1e-3 * (distance[i] + distance[j])
         score = jnp.where(held & both == both, score, -jnp.inf)
-        return _best_apart(score, cells, 2, apart, width)
+        return _best_cells(score, cells, 2, min_distance, width)
 
     cell, valid = (x.reshape(-1) for x in jax.vmap(best_of_pair)(first, second))
     order = jnp.argsort(~valid, stable=True)
-    order = (
-        jnp.resize(order, MAX_LOCAL_ARCS) if len(order) < MAX_LOCAL_ARCS else order[:MAX_LOCAL_ARCS]
-    )
+    few = len(order) < MAX_LOCAL_ARCS
+    order = jnp.resize(order, (MAX_LOCAL_ARCS,)) if few else order[:MAX_LOCAL_ARCS]
     pair = jnp.repeat(jnp.stack([first, second], axis=1), 2, axis=0)
     return pair[order], cell[order], valid[order]
 
@@ -276,23 +279,24 @@ def _is_branch_end(ids: PropagatedIds, unseen: Array, wide: Array) -> Array:
     ids_around = _window(jnp.pad(ids.ids, 2), jnp.bitwise_or, 2)
     by_unseen = _window(jnp.pad(unseen, 2, constant_values=True), jnp.logical_or, 2)
     latest = _window(jnp.pad(ids.packed, 3, constant_values=-1), jnp.maximum, 3)
-    alone = (single_label(ids.ids) != 0) & (ids_around == ids.ids)
+    alone = (single_labels(ids.ids) != 0) & (ids_around == ids.ids)
     return alone & (ids.packed > 1) & (ids.packed == latest) & by_unseen & wide
 
 
-def _ends(
-    ids: PropagatedIds, unseen: Array, wide: Array, bit: Array, apart: int
+def _end_cells(
+    ids: PropagatedIds, unseen: Array, wide: Array, bit: Array, min_distance: int
 ) -> tuple[Array, Array, Array]:
-    """Where branches leave the visible region, those reached last first, `apart` cells apart.
+    """Where branches leave the visible region, those reached last first, `min_distance` apart.
 
     Returns:
-        Pairs (FRONTIERS, 2) of an id and -1, cells (FRONTIERS,), and whether there is one.
+        Pairs (P, 2) of an id and -1, cells (P,) and whether there is one (P,) bool, with
+        P = `MAX_LOCAL_FRONTIERS`.
     """
-    own, packed = single_label(ids.ids), ids.packed
+    own, packed = single_labels(ids.ids), ids.packed
     cells = _marked(sequential_vmap_on_cpu(_is_branch_end)(ids, unseen, wide))
     score = packed.reshape(-1).at[cells].get(mode="fill", fill_value=-1).astype(float)
     score = jnp.where(cells < packed.size, score, -jnp.inf)
-    cell, valid = _best_apart(score, cells, MAX_LOCAL_FRONTIERS, apart, packed.shape[1])
+    cell, valid = _best_cells(score, cells, MAX_LOCAL_FRONTIERS, min_distance, packed.shape[1])
     junction = jnp.argmax(own.reshape(-1)[cell][:, None] == bit[None, :-1], axis=1)
     junction = junction.astype(jnp.int32)
     return jnp.stack([junction, jnp.full_like(junction, -1)], axis=1), cell, valid

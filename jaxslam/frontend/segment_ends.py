@@ -78,10 +78,10 @@ def project_ends(end_beams: EndBeams, line: FittedLines, fitted: Array) -> tuple
     return x, y
 
 
-def adjacent(spans: BeamIntervals, end_beams: EndBeams) -> Array:
+def adjacent(intervals: BeamIntervals, end_beams: EndBeams) -> Array:
     """Whether the next piece (K,) begins at the next beam, without a jump between them."""
-    slot = jnp.arange(spans.first.size, dtype=jnp.int32)
-    next_beam = spans.last + 1 == jnp.roll(spans.first, -1)
+    slot = jnp.arange(intervals.first.size, dtype=jnp.int32)
+    next_beam = intervals.last + 1 == jnp.roll(intervals.first, -1)
     return (slot < slot.size - 1) & next_beam & (end_beams.jump[:, 1] == 0.0)
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.scan import Lidar, Scan, as_scan
 from jaxslam.core.se2 import dot, unit_vector
 from jaxslam.core.types import Array
 from jaxslam.frontend import line_fitting, segment_ends
@@ -19,14 +19,14 @@ from jaxslam.frontend.segment_ends import (
     segment_corners,
     vector_length,
 )
-from jaxslam.frontend.segments import Segments, SegmentSpec
+from jaxslam.frontend.segments import Segments, SegmentSpec, check_segment_spec
 
 
 class _Pieces(NamedTuple):
     """Pieces of a scan between its cuts; those with most beams have a slot 0..K-1 each.
 
     Attributes:
-        spans: (K,) first and last beam.
+        intervals: (K,) first and last beam.
         of_beam: (R,) int32 slot of each beam, K for none.
         valid: (K,) bool.
         fitted: (K,) bool, valid and of three beams or more: a line is fitted.
@@ -34,7 +34,7 @@ class _Pieces(NamedTuple):
         surplus: () int32 slot of the fewest beams; if there are more pieces, it takes these too.
     """
 
-    spans: BeamIntervals
+    intervals: BeamIntervals
     of_beam: Array
     valid: Array
     fitted: Array
@@ -56,7 +56,7 @@ def range_jumps(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Array:
     twice = 2 * jnp.cos(jnp.asarray(lidar.angle_increment, r.dtype))
 
     def prediction_error(second: Array, nearest: Array, measured: Array) -> Array:
-        """Error [m] of a range from the nearest beam and the second, less what is uneven."""
+        """Error [m] of a range from the nearest beam and the second, less that of roughness."""
         inverse = twice / nearest - 1.0 / second
         predicted = jnp.where(inverse > 0.0, 1.0 / jnp.maximum(inverse, 1e-6), jnp.inf)
         # An offset of the wall changes a range by 1 / cos(angle of incidence) times as much.
@@ -85,33 +85,36 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
                  .  beam beyond the end
                   .
         ends[1, 1]  o-----------------------+  ends[1, 0] = ends[0, 1]
-        occluding    .      normal[1]       |  a corner: meets[0], both ends real
-        end: sharp    .         |           |
-        and real       .        v           |
+        occluding    .      normal[1]       |  a corner: meets_next[0], both ends real
+        end, real     .         |           |
+                       .        v           |
                         .                   |  ^
-                         R    normal[0] <-- |  | along[0]
+                         R    normal[0] <-- |  | tangent[0]
                                             o  ends[0, 0]
                                                only the view ends here: not real
 
     Steps:
 
-    1. Split the beams at jumps and where straight lines explain them best (`line_fitting.partition_beams`).
+    1. Split the beams at jumps and where straight lines fit best (`line_fitting.partition_beams`).
     2. Give the pieces with most beams a slot each (`_longest_pieces`). If there are more than
-       `capacity`, the slot of the fewest beams takes all others too, and is not valid: its beams
-       are obstacles without a line.
+       `max_segments`, the slot of the fewest beams takes all others too, and is not valid: its
+       beams are obstacles without a line.
     3. Fit a line to each by weighted total least squares (`_fit_lines`).
     4. Project the outermost hits onto the lines (`project_ends`).
     5. Intersect the lines of adjacent segments: corners (`segment_corners`).
     6. Classify the other ends; an occluding end is half a beam beyond its hit (`free_ends`).
 
     Args:
-        scan: The scan.
-        lidar: Its scanner.
+        lidar: The scanner.
         spec: Parameters.
+        scan: One of its scans; NumPy arrays, lists or JAX arrays.
 
     Raises:
-        ValueError: The ranges are not those of one scan of this lidar; while tracing.
+        ValueError: Scanner or parameters are impossible, or ranges or hits are not those of one of
+            its scans; while tracing.
     """
+    check_segment_spec(spec)
+    scan = as_scan(lidar, scan)
     xy = beam_ends(lidar, scan)
     jump = range_jumps(lidar, spec, scan)
     noise = max(lidar.range_std, 0.005)
@@ -127,12 +130,12 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
         roughness_length=spec.roughness_length,
     )
     pieces = _longest_pieces(cut.begins, scan.hit, spec.max_segments)
-    end_beams = _end_beams(scan.ranges, xy, jump, cut.normal, pieces.spans)
+    end_beams = _end_beams(scan.ranges, xy, jump, cut.normal, pieces.intervals)
     line = _fit_lines(
         xy, unit_vector(beam_angles(lidar)).astype(xy.dtype), pieces, end_beams, noise, spec
     )
     x, y = project_ends(end_beams, line, pieces.fitted)
-    adjacent = segment_ends.adjacent(pieces.spans, end_beams)
+    adjacent = segment_ends.adjacent(pieces.intervals, end_beams)
     corner, meets = segment_corners(line, x, y, adjacent, pieces.fitted, noise, lidar, spec)
     free, occluding = free_ends(line, x, y, end_beams, pieces.fitted, lidar)
 
@@ -151,7 +154,7 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
         end_occludes=occluding,
         offset_variance=line.offset_variance,
         angle_variance=line.angle_variance,
-        count=pieces.spans.size,
+        num_beams=pieces.intervals.size,
         meets_next=meets,
         valid=pieces.valid,
         segment_of_beam=jnp.where(surplus_beam, pieces.surplus, pieces.of_beam),
@@ -159,23 +162,29 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
 
 
 def _longest_pieces(begins: Array, hit: Array, capacity: int) -> _Pieces:
-    """The `capacity` pieces with most beams; `begins` and `hit` (R,) as of `line_fitting.longest_intervals`."""
-    spans = line_fitting.longest_intervals(begins, hit, capacity=capacity)
-    fewest = jnp.argmin(spans.size).astype(jnp.int32)
+    """The `capacity` pieces with most beams.
+
+    Args:
+        begins: (R,) bool, a piece begins at this beam.
+        hit: (R,) bool, the beam returned.
+        capacity: K.
+    """
+    intervals = line_fitting.longest_intervals(begins, hit, capacity=capacity)
+    fewest = jnp.argmin(intervals.size).astype(jnp.int32)
     overflow = jnp.sum(begins & hit, dtype=jnp.int32) > capacity
     own = ~(overflow & (jnp.arange(capacity, dtype=jnp.int32) == fewest))
     return _Pieces(
-        spans=spans,
-        of_beam=spans.interval_of_beam(hit.size),
-        valid=own & (spans.size > 0),
-        fitted=own & (spans.size >= 3),
+        intervals=intervals,
+        of_beam=intervals.interval_of_beam(hit.size),
+        valid=own & (intervals.size > 0),
+        fitted=own & (intervals.size >= 3),
         overflow=overflow,
         surplus=fewest,
     )
 
 
 def _end_beams(
-    ranges: Array, xy: Array, jump: Array, normal: Array, spans: BeamIntervals
+    ranges: Array, xy: Array, jump: Array, normal: Array, intervals: BeamIntervals
 ) -> EndBeams:
     """First and last beam of each piece and what is beside them, by one gather.
 
@@ -184,7 +193,7 @@ def _end_beams(
         xy: (R, 2) [m] hits.
         jump: (R,) bool, of `range_jumps`.
         normal: (R, 2), of `Partition`.
-        spans: (K,) first and last beams.
+        intervals: (K,) first and last beams.
     """
     jump = jump.astype(ranges.dtype)
     before = jnp.stack([jnp.roll(ranges, 1), jump], axis=1)
@@ -192,7 +201,7 @@ def _end_beams(
     # Range 0 outside the field of view: no wall ends there, only the view of it.
     before, after = before.at[0].set(0.0), after.at[-1, 0].set(0.0)
     table = jnp.concatenate([xy, normal, ranges[:, None], before, after], axis=1)
-    first, last = jnp.minimum(spans.first, ranges.size - 1), jnp.maximum(spans.last, 0)
+    first, last = jnp.minimum(intervals.first, ranges.size - 1), jnp.maximum(intervals.last, 0)
     beams = table[jnp.stack([first, last], axis=1)]  # (K, 2, 9)
     return EndBeams(
         first=first,
@@ -212,7 +221,7 @@ def _fit_lines(
     """Weighted total least squares: one line for each piece.
 
     A range error e moves a point by e cos(incidence) across the wall, so grazing beams count more:
-    weight = 1 / ((noise cos)^2 + rough^2). Of six beams or more the outermost two do not count:
+    weight = 1 / ((noise cos)^2 + point_std^2). Of six beams or more the outermost two do not count:
     they may be mixed pixels. With W the sum of the weights and S that of weight times the squared
     coordinate along the line, the variances are scale / W of the offset and scale / S of the angle.
     The scale is the reduced chi-square, with four more degrees of freedom at their expectation.
@@ -225,7 +234,7 @@ def _fit_lines(
         noise: [m] standard deviation of a range.
         spec: Parameters.
     """
-    count, of_beam = pieces.spans.size, pieces.of_beam
+    count, of_beam = pieces.intervals.size, pieces.of_beam
     trim = jnp.where(count >= 6, 1, 0)
     inner = jnp.stack([end_beams.first + trim, end_beams.last - trim], axis=1)
     inner = inner.at[of_beam].get(mode="clip")  # (R, 2)

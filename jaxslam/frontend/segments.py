@@ -1,7 +1,7 @@
-"""Sources of the Voronoi automaton in a scan: edge codes (paper) or straight segments (default).
+"""Straight wall segments of a scan: the records, and the cells of the grid that they lie on.
 
-Edge codes label each boundary cell by the pattern of its neighbours (`edge_codes`). A segment is one
-straight piece of wall, found in the order of the beams, with its line fit (`find_segments`).
+They are found in the order of the beams, with their line fits (`segmentation.find_segments`). They
+are the default sources of the Voronoi automaton; the paper's are edge codes (`edge_codes`).
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from jaxslam.frontend.lidar import beam_ends
 class Segments(NamedTuple):
     """Straight wall segments of a scan, counter-clockwise in the order of its beams, padded to K.
 
-    Robot frame throughout. See `find_segments` for a figure.
+    Robot frame throughout. See `segmentation.find_segments` for a figure.
 
     Attributes:
         normal: (K, 2) unit normal of the line, towards the robot.
@@ -29,7 +29,7 @@ class Segments(NamedTuple):
         end_occludes: (K, 2) bool, occluding end: what lies behind it is hidden by the wall.
         offset_variance: (K,) [m^2] variance of the line across itself, at `centre`.
         angle_variance: (K,) [rad^2] variance of its direction.
-        count: (K,) int32 number of beams.
+        num_beams: (K,) int32 number of beams.
         meets_next: (K,) bool, this segment meets the next one in a corner, at `ends[:, 1]`.
         valid: (K,) bool, False for padding and for the slot of all surplus segments.
         segment_of_beam: (R,) int32 segment of each beam, K for none.
@@ -43,7 +43,7 @@ class Segments(NamedTuple):
     end_occludes: Array
     offset_variance: Array
     angle_variance: Array
-    count: Array
+    num_beams: Array
     meets_next: Array
     valid: Array
     segment_of_beam: Array
@@ -67,7 +67,7 @@ class SegmentSpec(NamedTuple):
     """Parameters of the segmentation of scans; static under jit.
 
     Attributes:
-        max_segments: K, most segments; one label bit each, and one for the automaton.
+        max_segments: K, most segments, at most `MAX_SEGMENTS`.
         jump_distance: [m] two successive hits nearer to each other than this are never a jump.
         segment_cost: Cost of a segment, in squared standard deviations.
         outlier_cost: Bound of the cost of one beam, in squared standard deviations.
@@ -75,7 +75,8 @@ class SegmentSpec(NamedTuple):
         roughness_std: [m] standard deviation of a wall about its line that does not split it.
         roughness_length: [m] length of wall over which that deviation is the same.
         point_std: [m] standard deviation added to each point in the line fit.
-        corner_tolerance: [m] distance at most from the ends of two adjacent segments to their corner.
+        corner_tolerance: [m] largest distance from the ends of two adjacent segments to their
+            corner.
     """
 
     max_segments: int = 31
@@ -89,16 +90,30 @@ class SegmentSpec(NamedTuple):
     corner_tolerance: float = 0.15
 
 
+MAX_SEGMENTS = 32
+"""Most segments of a scan: each is one bit of a label set."""
+
+
+def check_segment_spec(spec: SegmentSpec) -> None:
+    """Raise ValueError, naming the field, unless a segmentation can have these parameters."""
+    if not isinstance(spec, SegmentSpec):
+        raise ValueError(f"segments is a {type(spec).__name__}, not a SegmentSpec")
+    if not 1 <= spec.max_segments <= MAX_SEGMENTS:
+        raise ValueError(f"segments.max_segments is {spec.max_segments}, not 1..{MAX_SEGMENTS}")
+    if spec.num_candidates < 1:
+        raise ValueError(f"segments.num_candidates is {spec.num_candidates}, not 1 or more")
+
+
 def segment_cells(
     lidar: Lidar, spec: GridSpec, scan: Scan, segments: Segments, *, points_per_gap: int = 6
 ) -> Array:
     """Segment (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
 
     Args:
-        scan: The scan.
-        lidar: Its scanner.
-        segments: Its segments; where two share a cell, the later one has it.
+        lidar: The scanner.
         spec: The grid to draw on.
+        scan: The scan.
+        segments: Its segments; where two share a cell, the later one has it.
         points_per_gap: Points drawn from each hit to the next of the same segment.
 
     Raises:

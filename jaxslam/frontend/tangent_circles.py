@@ -13,8 +13,9 @@ farther from any other: it is the centre of a circle that touches three walls an
         |                     |      empty:  d_j >= radius for every other wall j
      wall 1                wall 2
 
-`nearest_three_walls` picks the walls to start with, `tangent_circles` solves for the tangent circle and exchanges
-walls until it is empty, `fit_circles` refines the circle with all walls that it touches.
+`nearest_three_walls` picks the walls to start with, `tangent_circles` solves for the tangent circle
+and exchanges walls until it is empty, `circle_fitting.fit_circles` refines the circle with all
+walls that it touches.
 
 Layout: walls lead (K) and circles trail (C), so that sums and minima over the walls are vectorised
 over all circles.
@@ -40,13 +41,13 @@ class WallSegments(NamedTuple):
     Attributes:
         start: ((K, C), (K, C)) [m] x and y of the first end, robot frame.
         along: ((K, C), (K, C)) unit vector from the first end to the second.
-        size: (K, C) [m] length.
+        length: (K, C) [m].
         valid: (K, C) bool, False marks padding.
     """
 
     start: tuple[Array, Array]
     along: tuple[Array, Array]
-    size: Array
+    length: Array
     valid: Array
 
     def of(self, index: Array) -> "WallSegments":
@@ -76,9 +77,11 @@ class TangentCircles(NamedTuple):
         y: (C,) [m] centre, robot frame.
         radius: (C,) [m] mean distance to the three walls.
         walls: (3, C) int32 index of the walls.
-        penetration: (C,) [m] by which the nearest other wall cuts into the circle; negative if none does.
+        penetration: (C,) [m] by which the nearest other wall cuts into the circle; negative if none
+            does.
         min_angle: (C,) [rad] smallest angle between two of the three feet, seen from the centre.
-        fourth_wall: (C,) int32 nearest wall whose foot lies in another direction than all three feet.
+        fourth_wall: (C,) int32 nearest wall whose foot lies in another direction than all three
+            feet.
     """
 
     x: Array
@@ -90,17 +93,17 @@ class TangentCircles(NamedTuple):
     fourth_wall: Array
 
 
-def wall_segments(runs: Segments) -> WallSegments:
+def wall_segments(segments: Segments) -> WallSegments:
     """Wall segments (K, 1) between the ends of the straight segments of a scan."""
-    start, end = runs.ends[:, 0], runs.ends[:, 1]
+    start, end = segments.ends[:, 0], segments.ends[:, 1]
     gap = end - start
     length = jnp.sqrt(jnp.maximum(dot(gap, gap), 1e-12))
     along = gap / length[:, None]
     return WallSegments(
         start=(start[:, :1], start[:, 1:]),
         along=(along[:, :1], along[:, 1:]),
-        size=length[:, None],
-        valid=runs.valid[:, None],
+        length=length[:, None],
+        valid=segments.valid[:, None],
     )
 
 
@@ -108,7 +111,7 @@ def foot_points(x: Array, y: Array, walls: WallSegments) -> FootPoints:
     """Feet (K, C) of walls (K, C) or (K, 1) for centres x, y (C,) [m, robot frame]."""
     (start_x, start_y), (along_x, along_y) = walls.start, walls.along
     x, y = x[None], y[None]
-    position = jnp.clip((x - start_x) * along_x + (y - start_y) * along_y, 0.0, walls.size)
+    position = jnp.clip((x - start_x) * along_x + (y - start_y) * along_y, 0.0, walls.length)
     dx, dy = start_x + position * along_x - x, start_y + position * along_y - y
     distance = jnp.sqrt(jnp.maximum(dx * dx + dy * dy, 1e-8))
     toward = dx / distance, dy / distance
@@ -131,21 +134,21 @@ def foot_cosine(toward: tuple[Array, Array], wall: Array) -> Array:
     return tx * wall_tx[None] + ty * wall_ty[None]
 
 
-def nearest_three_walls(f: FootPoints, alike: float) -> Array:
+def nearest_three_walls(foot: FootPoints, max_cosine: float) -> Array:
     """The three nearest walls whose feet lie in different directions.
 
     Args:
-        f: Feet of K walls for C circles.
-        alike: Cosine of the smallest angle between two of the three feet.
+        foot: Feet of K walls for C circles.
+        max_cosine: Cosine of the smallest angle between two of the three feet.
 
     Returns:
         Index (3, C) int32, nearest first.
     """
-    first = nearest_wall(f.distance)
-    near_first = foot_cosine(f.toward, first)
-    second = nearest_wall(jnp.where(near_first < alike, f.distance, jnp.inf))
-    near_both = jnp.maximum(near_first, foot_cosine(f.toward, second))
-    third = nearest_wall(jnp.where(near_both < alike, f.distance, jnp.inf))
+    first = nearest_wall(foot.distance)
+    near_first = foot_cosine(foot.toward, first)
+    second = nearest_wall(jnp.where(near_first < max_cosine, foot.distance, jnp.inf))
+    near_both = jnp.maximum(near_first, foot_cosine(foot.toward, second))
+    third = nearest_wall(jnp.where(near_both < max_cosine, foot.distance, jnp.inf))
     return jnp.stack([first, second, third])
 
 
@@ -181,7 +184,7 @@ def _newton(x: Array, y: Array, three: WallSegments) -> tuple[Array, Array, Foot
     return x, y, foot
 
 
-def _one_of(three: Array, index: Array) -> Array:
+def one_of(three: Array, index: Array) -> Array:
     """Whether each wall, `index` (K, 1), is one of the three (3, C) of a circle: (K, C) bool."""
     return (index == three[:1]) | (index == three[1:2]) | (index == three[2:])
 
@@ -199,6 +202,10 @@ def _most_similar(cosines: list[Array], wall: Array, index: Array) -> Array:
     return nearest_wall(-jnp.stack(cosine))
 
 
+_Carry = tuple[tuple[Array, Array, Array], TangentCircles]
+"""Centres x and y (C,) and walls (3, C) to go on with, and the last solution."""
+
+
 def tangent_circles(
     x: Array, y: Array, three: Array, walls: WallSegments, *, swaps: int
 ) -> TangentCircles:
@@ -211,13 +218,13 @@ def tangent_circles(
             -------+-------               repeat `swaps` + 1 times:
         |          f0         |  wall 2       solve for the circle tangent to the three (`_newton`)
         |              |      |               j = the nearest other wall
-     f1 +          c   + fj   + f2            depth = radius - d_j
-        |              |      |               if depth > 1 mm:
+     f1 +          c   + fj   + f2            penetration = radius - d_j
+        |              |      |               if penetration > 1 mm:
      wall 1          wall j                       j replaces the wall k of largest t_j . t_k
 
     The *fourth* wall is the nearest other one whose foot is in none of the three directions (all
-    cosines below `MAX_FOOT_COSINE`). Three junctions may lie close by: those in which it replaces one of the
-    three walls. `junctions.find_junctions` searches these.
+    cosines below `MAX_FOOT_COSINE`). Three junctions may lie close by: those in which it replaces
+    one of the three walls. `junctions.find_junctions` searches these.
 
     Args:
         x: (C,) [m] initial centre, robot frame.
@@ -227,35 +234,37 @@ def tangent_circles(
         swaps: How many times a wall may be replaced.
 
     Returns:
-        The C circles, with `depth` and `fourth` of the last solution.
+        The C circles, with `penetration` and `fourth_wall` of the last solution.
     """
-    index = jnp.arange(len(walls.size), dtype=jnp.int32)[:, None]
+    index = jnp.arange(len(walls.length), dtype=jnp.int32)[:, None]
 
-    def solve_and_swap(x: Array, y: Array, three: Array):
+    def solve_and_swap(
+        x: Array, y: Array, three: Array
+    ) -> tuple[tuple[Array, Array, Array], TangentCircles]:
         x, y, own = _newton(x, y, walls.of(three))
         every = foot_points(x, y, walls)
         radius = jnp.mean(own.distance, axis=0)
-        others = jnp.where(_one_of(three, index), jnp.inf, every.distance)  # (K, C)
-        intruder, depth = nearest_wall(others), radius - jnp.min(others, axis=0)
+        others = jnp.where(one_of(three, index), jnp.inf, every.distance)  # (K, C)
+        intruder, penetration = nearest_wall(others), radius - jnp.min(others, axis=0)
         (tx, ty), (own_tx, own_ty) = every.toward, own.toward
         cosines = [tx * own_tx[k][None] + ty * own_ty[k][None] for k in range(3)]
         replaced = _most_similar(cosines, intruder, index)
         replaces = jnp.arange(3, dtype=jnp.int32)[:, None] == replaced[None]  # (3, C)
-        replaces &= (depth > 1e-3)[None]
+        replaces &= (penetration > 1e-3)[None]
         largest = jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2])
         fourth = nearest_wall(jnp.where(largest < MAX_FOOT_COSINE, others, jnp.inf))
         between = [
             own_tx[i] * own_tx[j] + own_ty[i] * own_ty[j] for i, j in ((0, 1), (1, 2), (2, 0))
         ]
         cosine = jnp.maximum(jnp.maximum(between[0], between[1]), between[2])
-        solved = TangentCircles(x, y, radius, three, depth, cosine, fourth)
+        solved = TangentCircles(x, y, radius, three, penetration, cosine, fourth)
         return (x, y, jnp.where(replaces, intruder[None], three)), solved
 
-    def body(carry, _: None):
+    def body(carry: _Carry, _: None) -> tuple[_Carry, None]:
         return solve_and_swap(*carry[0]), None
 
     zero = jnp.zeros_like(x)
     unsolved = TangentCircles(x, y, zero, three, zero, zero, jnp.zeros_like(three[0]))
     (_, last), _ = lax.scan(body, ((x, y, three), unsolved), length=swaps + 1)
-    # Up to here `spread` holds the cosine.
+    # Up to here `min_angle` holds the cosine.
     return last._replace(min_angle=jnp.arccos(jnp.clip(last.min_angle, -0.9999, 0.9999)))

@@ -22,74 +22,78 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.types import Array
-from jaxslam.frontend.automaton import Diagram, expand
+from jaxslam.core.types import AnyArray, Array, as_bool
+from jaxslam.frontend.automaton import Diagram, as_labels, expand
 
 TILE = 64  # [cells] side of a tile
 HALO = 16  # [cells] width of the halo, and number of steps in a round
-BATCH = 16  # tiles that are expanded together
+TILE_BATCH = 16  # tiles that are expanded together
 
 
 @partial(jax.jit, static_argnames="steps")
-def _expand_windows(labels: Array, is_open: Array, *, steps: int) -> Diagram:
+def _expand_windows(labels: Array, is_free: Array, *, steps: int) -> Diagram:
     """`automaton.expand` of a batch of windows (B, H, W)."""
-    return jax.vmap(partial(expand, steps=steps))(labels, is_open)
+    return jax.vmap(partial(expand, steps=steps))(labels, is_free)
 
 
 def expand_tiled(
-    labels: Array, open: Array, *, steps: int | None = None, tile: int = TILE, halo: int = HALO
+    labels: AnyArray,
+    free: AnyArray,
+    *,
+    steps: int | None = None,
+    tile: int = TILE,
+    halo: int = HALO,
 ) -> Diagram:
     """Expand all sources of a map together, as `automaton.expand` does.
 
     For maps in files: the rounds are counted in Python, so it can be neither jitted nor batched.
 
     Args:
-        labels: (H, W) unsigned bit sets as for `automaton.expand`; non-zero cells are the sources.
-        open: (H, W) bool, the cells that fronts may enter.
-        steps: Number of steps; without it, until nothing changes any more.
+        labels: (H, W) bit sets as for `automaton.expand`; non-zero cells are the sources.
+        free: (H, W) bool, the cells that fronts may enter.
+        steps: Number of steps; None: until nothing changes any more.
         tile: Side of a tile [cells].
         halo: Width [cells] of the halo around a tile, at most `tile`; as many steps make a round.
 
     Raises:
-        ValueError: The arrays differ in shape, `halo` is not from 1 to `tile`, or `steps` is
-            negative.
+        ValueError: An array has another shape or type, `halo` is not from 1 to `tile`, or `steps`
+            is negative.
     """
-    sources, is_open = np.asarray(labels), np.asarray(open, bool)
-    if sources.ndim != 2 or sources.shape != is_open.shape:
-        raise ValueError(f"labels {sources.shape} and open {is_open.shape} are not both (H, W)")
+    sources = np.asarray(as_labels("labels", labels))
+    is_free = np.asarray(as_bool("free", free, sources.shape))
     if not 1 <= halo <= tile:
         raise ValueError(f"halo {halo} is not between 1 and the tile's {tile} cells")
     if steps is not None and steps < 0:
         raise ValueError(f"steps is {steps}, not 0 or more")
     height, width = sources.shape
     rows, columns = -(-height // tile), -(-width // tile)
-    # Whole tiles and a halo around them; the padding is closed.
+    # Whole tiles and a halo around them; the padding is not free.
     margins = ((halo, halo + rows * tile - height), (halo, halo + columns * tile - width))
-    cells, is_open = np.pad(sources, margins), np.pad(is_open, margins)
+    cells, is_free = np.pad(sources, margins), np.pad(is_free, margins)
     arrival = np.where(cells != 0, 0, -1).astype(np.int32)
     all_tiles = np.s_[halo : halo + rows * tile, halo : halo + columns * tile]
-    empty = (is_open & (cells == 0))[all_tiles].reshape(rows, tile, columns, tile)
+    empty = (is_free & (cells == 0))[all_tiles].reshape(rows, tile, columns, tile)
     has_empty = empty.any(axis=(1, 3))
     changed, done = np.ones((rows, columns), bool), 0
     while changed.any() and (steps is None or done < steps):
         steps_left = halo if steps is None else min(halo, steps - done)
         active = np.argwhere(_dilate(changed) & has_empty)
-        changed, results = np.zeros_like(changed), _advance(cells, is_open, active, tile, halo)
+        changed, results = np.zeros_like(changed), _advance(cells, is_free, active, tile, halo)
         for index, tile_labels, step in results:
             i, j = index * tile + halo
-            place = np.s_[i : i + tile, j : j + tile]
+            window = np.s_[i : i + tile, j : j + tile]
             new = (step > 0) & (step <= steps_left)
-            cells[place] = np.where(new, tile_labels, cells[place])
-            arrival[place] = np.where(new, done + step, arrival[place])
+            cells[window] = np.where(new, tile_labels, cells[window])
+            arrival[window] = np.where(new, done + step, arrival[window])
             changed[tuple(index)] = new.any()
-            has_empty[tuple(index)] = (is_open[place] & (cells[place] == 0)).any()
+            has_empty[tuple(index)] = (is_free[window] & (cells[window] == 0)).any()
         done += steps_left
     inner = np.s_[halo : halo + height, halo : halo + width]
     return Diagram(labels=jnp.asarray(cells[inner]), arrival=jnp.asarray(arrival[inner]))
 
 
 def _advance(
-    cells: np.ndarray, is_open: np.ndarray, active: np.ndarray, tile: int, halo: int
+    cells: np.ndarray, is_free: np.ndarray, active: np.ndarray, tile: int, halo: int
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Advance tiles by one round of `halo` steps.
 
@@ -97,7 +101,7 @@ def _advance(
 
     Args:
         cells: Labels of the padded map.
-        is_open: Its open cells.
+        is_free: Its free cells.
         active: (A, 2) index of each tile to advance.
         tile: Side of a tile [cells].
         halo: Width of the halo [cells].
@@ -105,14 +109,16 @@ def _advance(
     Returns:
         Of each tile its index (2,), and labels and step of arrival in this round (tile, tile).
     """
-    side, results = tile + 2 * halo, []
+    side = tile + 2 * halo
+    results: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     inner = np.s_[:, halo : halo + tile, halo : halo + tile]
-    for first in range(0, len(active), BATCH):
-        batch = active[first : first + BATCH]
-        corners = np.resize(batch, (BATCH, 2)) * tile  # always BATCH, so one compiled program
+    for first in range(0, len(active), TILE_BATCH):
+        batch = active[first : first + TILE_BATCH]
+        # Always TILE_BATCH of them, so that there is one compiled program.
+        corners = np.resize(batch, (TILE_BATCH, 2)) * tile
         diagram = _expand_windows(
             np.stack([cells[i : i + side, j : j + side] for i, j in corners]),
-            np.stack([is_open[i : i + side, j : j + side] for i, j in corners]),
+            np.stack([is_free[i : i + side, j : j + side] for i, j in corners]),
             steps=halo,
         )
         results += zip(batch, *(np.asarray(x)[inner] for x in diagram), strict=False)

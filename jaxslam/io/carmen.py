@@ -26,7 +26,7 @@ from jaxslam.core.logs import (
 from jaxslam.core.scan import Lidar
 from jaxslam.core.time_series import interpolate_poses, sort_by_time
 from jaxslam.io import robotlaser
-from jaxslam.io.errors import InputError
+from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.odometry_repair import poses_are_corrected, remove_jumps
 from jaxslam.io.robotlaser import RobotLaser
 from jaxslam.io.text import lines, number
@@ -55,11 +55,11 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
         range_max: Range [m] from which on a reading counts as no return; so does one <= 0.
 
     Raises:
-        InputError: The file cannot be read or is no CARMEN log, more than 5 % of its ODOM and
-            FLASER lines are broken, there is no scan, or its odometry never changes.
+        InputError: `range_max` is not positive, the file cannot be read or is no CARMEN log, more
+            than 5 % of its ODOM and FLASER lines are broken, there is no scan, or its odometry
+            never changes.
     """
-    if not 0.0 < range_max < math.inf:
-        raise InputError(f"range_max {range_max} m", advice="give a positive number of metres")
+    check_range_max(range_max)
     odometry: list[_StampedPose] = []
     flaser: list[_FlaserScan] = []
     robotlaser1: dict[int, RobotLaser] = {}
@@ -101,8 +101,9 @@ def _parse_odom(fields: list[bytes]) -> _StampedPose:
     """Time and pose of an ODOM line; errors carry no line number."""
     if len(fields) != 10:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of 10")
-    names = ("field 8 (ipc_time)", "field 2 (x)", "field 3 (y)", "field 4 (theta)")
-    return tuple(number(fields[i], name) for i, name in zip((7, 1, 2, 3), names, strict=True))
+    time = number(fields[7], "field 8 (ipc_time)")
+    x, y = number(fields[1], "field 2 (x)"), number(fields[2], "field 3 (y)")
+    return time, x, y, number(fields[3], "field 4 (theta)")
 
 
 def _parse_flaser(fields: list[bytes]) -> tuple[_StampedPose, np.ndarray]:
@@ -116,12 +117,12 @@ def _parse_flaser(fields: list[bytes]) -> tuple[_StampedPose, np.ndarray]:
         raise InputError("no odometry: the fields x y theta odom_x odom_y odom_theta are missing")
     if num_other != 9:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of {num_beams + 11}")
-    names = ("ipc_time", "odom_x", "odom_y", "odom_theta")
-    columns = (num_beams + 8, num_beams + 5, num_beams + 6, num_beams + 7)
-    stamped_pose = tuple(
-        number(fields[i], f"field {i + 1} ({name})") for i, name in zip(columns, names, strict=True)
+    names = {8: "ipc_time", 5: "odom_x", 6: "odom_y", 7: "odom_theta"}
+    time, x, y, theta = (
+        number(fields[num_beams + i], f"field {num_beams + i + 1} ({name})")
+        for i, name in names.items()
     )
-    return stamped_pose, _parse_ranges(fields[2 : 2 + num_beams])
+    return (time, x, y, theta), _parse_ranges(fields[2 : 2 + num_beams])
 
 
 def _parse_ranges(fields: list[bytes]) -> np.ndarray:

@@ -29,7 +29,7 @@ def write(path: str | PathLike, state: Any, about: Mapping[str, Any]) -> None:
     leaves = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
     arrays = {ABOUT: np.asarray(json.dumps(plain(about)))} | leaves
     with replace(path) as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # the stub takes a name for an option
 
 
 def read(path: str | PathLike, template: Tree, about: Mapping[str, Any]) -> Tree:
@@ -57,7 +57,7 @@ def read(path: str | PathLike, template: Tree, about: Mapping[str, Any]) -> Tree
             raise InputError("belongs to another run", path=path, field=name, advice=advice)
     template_leaves, structure = jax.tree.flatten(template)
     same = len(template_leaves) == len(leaves) and all(
-        np.shape(wanted) == found.descriptor and np.asarray(wanted).dtype == found.dtype
+        np.shape(wanted) == found.shape and np.asarray(wanted).dtype == found.dtype
         for wanted, found in zip(template_leaves, leaves, strict=True)
     )
     if not same:

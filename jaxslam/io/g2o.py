@@ -8,7 +8,6 @@ A scan belongs to the vertex before it. Edges from a vertex to the next one in t
 odometry; all other edges (loop closures) and the poses of the vertices are ignored.
 """
 
-import math
 from collections import Counter
 from os import PathLike
 
@@ -22,9 +21,9 @@ from jaxslam.core.logs import (
     mark_no_return,
 )
 from jaxslam.core.scan import Lidar
-from jaxslam.core.se2_np import chain
+from jaxslam.core.se2_np import dead_reckoning
 from jaxslam.io import robotlaser
-from jaxslam.io.errors import InputError
+from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.robotlaser import RobotLaser
 from jaxslam.io.text import lines, number
 
@@ -40,15 +39,14 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
 
     Args:
         path: The file.
-        range_max: Range [m] from which on a reading counts as no return, unless the range_max of the
-            scans is smaller; so does one <= 0.
+        range_max: Range [m] from which on a reading counts as no return, unless the range_max of
+            the scans is smaller; so does one <= 0.
 
     Raises:
-        InputError: The file cannot be read, has no scan or no odometry from one vertex to the
-            next, a vertex or edge is broken, or more than 5 % of the scans.
+        InputError: `range_max` is not positive, the file cannot be read, has no scan or no odometry
+            from one vertex to the next, a vertex or edge is broken, or more than 5 % of the scans.
     """
-    if not 0.0 < range_max < math.inf:
-        raise InputError(f"range_max {range_max} m", advice="give a positive number of metres")
+    check_range_max(range_max)
     vertices: list[int] = []  # ids in file order
     scans: dict[int, RobotLaser] = {}
     edges: dict[tuple[int, int], tuple[float, ...]] = {}
@@ -116,14 +114,14 @@ def _build_log(
     skipped: int,
     range_max: float,
 ) -> LaserLog:
-    """Chain the odometry edges to poses, and keep those of vertices with a scan."""
+    """Poses by dead reckoning along the odometry edges, and keep those of vertices with a scan."""
     pairs = list(zip(vertices[:-1], vertices[1:], strict=True))
     for pair in pairs:
         if pair not in edges:
             problem = f"no EDGE_SE2 from vertex {pair[0]} to the next, {pair[1]}"
             raise InputError(problem, path=path, advice="name a graph with its odometry")
-    increments = np.array([edges[pair] for pair in pairs]).reshape(-1, 3)
-    poses = chain(increments)
+    increments = np.array([(0.0, 0.0, 0.0), *(edges[pair] for pair in pairs)])
+    poses = dead_reckoning(np.zeros(3), increments)
     has_scan = np.array([vertex in scans for vertex in vertices])
     kept = [scans[vertex] for vertex in vertices if vertex in scans]
     first = kept[0]

@@ -1,4 +1,4 @@
-"""Pose-landmark graphs in the format of g2o: the measurements of a run, for batch optimisers.
+"""Pose graphs with landmarks, written in the format of g2o for batch optimisers.
 
 VERTEX_SE2 id x y theta                      poses of the scans, 0..T-1
 VERTEX_XY id x y                             landmarks
@@ -15,6 +15,7 @@ from os import PathLike
 
 import numpy as np
 
+from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_text
 from jaxslam.mapping.pose_graph import PoseGraph
@@ -28,8 +29,10 @@ def write(path: str | PathLike, graph: PoseGraph) -> None:
         graph: The graph; landmark k becomes vertex T + k.
 
     Raises:
+        ValueError: A field is not numbers of its shape, or an index is out of range.
         InputError: Something is not finite, or the file cannot be written.
     """
+    graph = _checked(graph)
     for name, values in graph._asdict().items():
         if not np.isfinite(values).all():
             raise InputError(f"{name} holds numbers that are not finite", path=path)
@@ -59,6 +62,45 @@ def write(path: str | PathLike, graph: PoseGraph) -> None:
     write_text(path, "\n".join(text) + "\n")
 
 
+def _checked(graph: PoseGraph) -> PoseGraph:
+    """The graph with NumPy arrays in its fields; raise ValueError if one is wrong."""
+    poses = as_float64("poses", graph.poses, ("T", 3))
+    landmark_positions = as_float64("landmark_positions", graph.landmark_positions, ("L", 2))
+    odometry = as_float64("odometry", graph.odometry, (max(len(poses) - 1, 0), 3))
+    landmark_xy = as_float64("landmark_xy", graph.landmark_xy, ("K", 2))
+    closure_pose = as_float64("closure_pose", graph.closure_pose, ("C", 3))
+    num_observed, num_closures = len(landmark_xy), len(closure_pose)
+    return PoseGraph(
+        poses=poses,
+        landmark_positions=landmark_positions,
+        odometry=odometry,
+        odometry_information=as_float64(
+            "odometry_information", graph.odometry_information, (len(odometry), 3, 3)
+        ),
+        pose_index=_indices("pose_index", graph.pose_index, (num_observed,), len(poses)),
+        landmark_index=_indices(
+            "landmark_index", graph.landmark_index, (num_observed,), len(landmark_positions)
+        ),
+        landmark_xy=landmark_xy,
+        landmark_information=as_float64(
+            "landmark_information", graph.landmark_information, (num_observed, 2, 2)
+        ),
+        closure_ends=_indices("closure_ends", graph.closure_ends, (num_closures, 2), len(poses)),
+        closure_pose=closure_pose,
+        closure_information=as_float64(
+            "closure_information", graph.closure_information, (num_closures, 3, 3)
+        ),
+    )
+
+
+def _indices(name: str, x: AnyArray, shape: tuple[int, ...], count: int) -> np.ndarray:
+    """Integers of this shape; raise ValueError unless they are within 0 .. `count` - 1."""
+    indices = as_float64(name, x, shape).astype(int)
+    if indices.size and not (0 <= indices.min() and indices.max() < count):
+        raise ValueError(f"{name} has {indices.min()} to {indices.max()}, not 0 to {count - 1}")
+    return indices
+
+
 def _relative_poses(
     pairs: Iterable[Iterable[int]], relative_poses: np.ndarray, information: np.ndarray
 ) -> list[str]:
@@ -71,4 +113,5 @@ def _relative_poses(
 
 
 def _line(keyword: str, vertices: Iterable[int], values: Iterable[float]) -> str:
+    """A line of the file."""
     return " ".join([keyword, *map(str, vertices), *(repr(float(value)) for value in values)])

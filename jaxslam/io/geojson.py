@@ -59,13 +59,13 @@ def write(
 
     Args:
         path: File to write, atomically.
-        nodes: Nodes with distinct ids.
+        nodes: Their ids are distinct.
         arcs: Arcs between them.
         frame: Name of the frame of the coordinates.
 
     Raises:
-        ValueError: An id occurs twice or is negative, an arc ends at no node, or a coordinate or
-            length is not finite.
+        ValueError: Something is no `Node` or `Arc`, an id occurs twice or is negative, an arc ends
+            at no node, or a coordinate or length is not finite.
         InputError: The file cannot be written.
     """
     _check(nodes, arcs)
@@ -81,6 +81,10 @@ def write(
 
 def _check(nodes: Sequence[Node], arcs: Sequence[Arc]) -> None:
     """Raise ValueError unless nodes and arcs are a valid graph."""
+    for what, items, kind in (("nodes", nodes, Node), ("arcs", arcs, Arc)):
+        for index, item in enumerate(items):
+            if not isinstance(item, kind):
+                raise ValueError(f"{what}[{index}] is {type(item).__name__}, not {kind.__name__}")
     node_ids = [int(node.id) for node in nodes]
     for what, ids in (("node", node_ids), ("arc", [int(arc.id) for arc in arcs])):
         if len(set(ids)) != len(ids) or min(ids, default=0) < 0:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.types import as_float64
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_text
 
@@ -23,18 +24,22 @@ def require() -> None:
 def write(path: str | PathLike, graph: TopologicalMap) -> None:
     """Write a map as an undirected multigraph.
 
-    Nodes have `x`, `y` and `clearance`, edges `length` and `clearance`, all [m], and `line`, the
-    polyline in well-known text from `source` to `target`. Values that are not finite are left out.
+    A node has `x`, `y` and `clearance`, an edge `length` and `clearance`, all [m], and `line`,
+    the polyline in well-known text from `source` to `target`. Values that are not finite are left
+    out.
 
     Args:
         path: File to write, atomically.
         graph: The map.
 
     Raises:
+        ValueError: A field of the map is not numbers of its shape, or an arc ends at no node.
         InputError: networkx is not installed, or the file cannot be written.
     """
     require()
     import networkx
+
+    graph = _checked(graph)
 
     multigraph = networkx.MultiGraph()
     for node, (x, y), clearance in zip(graph.id, graph.xy, graph.clearance, strict=True):
@@ -42,10 +47,33 @@ def write(path: str | PathLike, graph: TopologicalMap) -> None:
         multigraph.add_nodes_from([(int(node), attributes)])
     for index, (start, end) in enumerate(graph.arc_ends):
         numbers = {"length": graph.arc_length[index], "clearance": graph.arc_clearance[index]}
-        attributes = {"line": _well_known_text(graph.arc_lines[index])} | _finite(numbers)
+        line = {"line": _well_known_text(graph.arc_lines[index])}
         source, target = int(graph.id[start]), int(graph.id[end])
-        multigraph.add_edges_from([(source, target, index, attributes)])
+        multigraph.add_edges_from([(source, target, index, line | _finite(numbers))])
     write_text(path, "\n".join(networkx.generate_graphml(multigraph)) + "\n")
+
+
+def _checked(graph: TopologicalMap) -> TopologicalMap:
+    """The map with NumPy arrays in what is written; raise ValueError if a field is wrong."""
+    xy = as_float64("xy", graph.xy, ("N", 2))
+    ends = as_float64("arc_ends", graph.arc_ends, ("A", 2)).astype(int)
+    num_nodes, num_arcs = len(xy), len(ends)
+    if ends.size and not (0 <= ends.min() and ends.max() < num_nodes):
+        raise ValueError(f"arc_ends has indices {ends.min()} to {ends.max()} of {num_nodes} nodes")
+    if len(graph.arc_lines) != num_arcs:
+        raise ValueError(f"arc_lines has {len(graph.arc_lines)} lines, arc_ends {num_arcs} arcs")
+    return graph._replace(
+        id=as_float64("id", graph.id, (num_nodes,)).astype(int),
+        xy=xy,
+        clearance=as_float64("clearance", graph.clearance, (num_nodes,)),
+        arc_ends=ends,
+        arc_length=as_float64("arc_length", graph.arc_length, (num_arcs,)),
+        arc_clearance=as_float64("arc_clearance", graph.arc_clearance, (num_arcs,)),
+        arc_lines=tuple(
+            as_float64(f"arc_lines[{index}]", line, ("n", 2))
+            for index, line in enumerate(graph.arc_lines)
+        ),
+    )
 
 
 def _finite(values: Mapping[str, Any]) -> dict[str, float]:

@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxslam.core.logs import DEFAULT_RANGE_STD, LaserLog, mark_no_return
 from jaxslam.core.scan import Lidar
-from jaxslam.io.errors import InputError
+from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.output import replace
 
 FORMAT, VERSION = "jaxslam-recording", 1
@@ -38,10 +38,32 @@ _ADVICE = f"it is a NumPy file with {', '.join(_REQUIRED)}"
 def write(path: str | PathLike, log: LaserLog) -> None:
     """Write a laser log.
 
+    Args:
+        path: File to write, atomically.
+        log: The log; its numbers may be NumPy arrays, JAX arrays or lists.
+
     Raises:
+        ValueError: `LaserLog.from_arrays` refuses a field, or `read` would refuse the scanner.
         InputError: The file cannot be written.
     """
+    log = LaserLog.from_arrays(
+        log.times,
+        log.odom_poses,
+        log.ranges,
+        log.lidar,
+        odom_stream_times=log.odom_stream_times,
+        odom_stream_poses=log.odom_stream_poses,
+    )
     lidar = log.lidar
+    limited = {
+        "angle_increment": _LIMITS["step"],
+        "range_max": _LIMITS["reach"],
+        "range_std": _LIMITS["noise"],
+    }
+    for field, (low, high) in limited.items():
+        value = getattr(lidar, field)
+        if not low <= value <= high:
+            raise ValueError(f"lidar.{field} is {value:g}, not between {low:g} and {high:g}")
     with replace(Path(path)) as file:
         np.savez_compressed(
             file,
@@ -64,13 +86,14 @@ def read(path: str | PathLike, *, range_max: float = math.inf) -> LaserLog:
 
     Args:
         path: The file.
-        range_max: Range [m] from which on a reading counts as no return, unless the file's `range_max` is
+        range_max: Range [m] from which on a reading counts as no return, unless that of the file is
             smaller.
 
     Raises:
-        InputError: The file cannot be read, lacks an array, has an unknown one, or one of a wrong
-            shape or with values out of range.
+        InputError: `range_max` is not positive; or the file cannot be read, lacks an array, has an
+            unknown one, or one of a wrong shape or with values out of range.
     """
+    check_range_max(range_max, infinite=True)
     arrays = _load(path)
     for name in sorted(arrays.keys() - {*_REQUIRED, *_OPTIONAL}):
         raise InputError("unknown array", path=path, field=name, advice=_ADVICE)

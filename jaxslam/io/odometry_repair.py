@@ -7,12 +7,11 @@ on.
 
 import numpy as np
 
-from jaxslam.core.se2_np import chain, relative
+from jaxslam.core.se2_np import dead_reckoning, relative
 from jaxslam.core.time_series import interpolate_poses, sort_by_time
 
-MAX_STEP = np.array(
-    [1.0, 1.0]
-)  # [m], [rad] tolerance of `odometry_jumps`, beyond what `MAX_SPEED` allows
+# [m], [rad] tolerance of `odometry_jumps`, beyond what `MAX_SPEED` allows
+MAX_STEP = np.array([1.0, 1.0])
 MAX_SPEED = np.array([5.0, 5.0])  # [m/s], [rad/s] no robot of these logs is faster
 SAME_FRAME_SPREAD = np.array([0.3, 0.1])  # [m], [rad] tolerance of `poses_are_corrected`
 MIN_OVERLAP = 0.9  # least fraction of the scans within the time of the odometry, for a comparison
@@ -48,7 +47,8 @@ def remove_jumps(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, int]
         return poses, 0
     increments = relative(poses[:-1], poses[1:])
     increments[is_jump] = 0.0
-    return chain(increments, poses[0]), int(is_jump.sum())
+    repaired = np.concatenate([poses[:1], dead_reckoning(poses[0], increments)])
+    return repaired, int(is_jump.sum())
 
 
 def poses_are_corrected(

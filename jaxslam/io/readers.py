@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 from jaxslam.core.logs import DEFAULT_RANGE_MAX, LaserLog
 from jaxslam.io import carmen, g2o, npz, ros_bags
-from jaxslam.io.errors import InputError
+from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.text import lines
 
-MAX_LINES_SEARCHED = 1000  # lines within which the first of a known format must come
+MAX_LINES_SEARCHED = 1000  # lines among which there must be one of a known format
 
 _KEYWORDS = {b"VERTEX_SE2": g2o, b"EDGE_SE2": g2o, b"VERTEX_XY": g2o}
 _KEYWORDS |= dict.fromkeys((b"FLASER", b"ODOM", b"ROBOTLASER1", b"PARAM", b"RLASER"), carmen)
@@ -35,7 +35,7 @@ class NamedLog(NamedTuple):
 NAMED_LOGS = {"killian": NamedLog("rtbdata", "data", ("data", "killian.g2o.zip"))}
 
 
-def read(
+def read_log(
     path: str | PathLike,
     *,
     range_max: float = DEFAULT_RANGE_MAX,
@@ -51,10 +51,12 @@ def read(
         odometry_topic: Topic of the odometry or of the transforms in a bag.
 
     Raises:
-        InputError: The format of the log is unknown, topics are named for a log without topics, or
-            the reader of the format raises it.
+        InputError: `path` is no path, `range_max` is not positive, the format of the log is
+            unknown, topics are named for a log without topics, or the reader of the format raises
+            it.
     """
-    path = find(path)
+    check_range_max(range_max, infinite=True)
+    path = find_log(path)
     reader = reader_of(path)
     if reader is ros_bags:
         return ros_bags.read(
@@ -62,15 +64,18 @@ def read(
         )
     if scan_topic is not None or odometry_topic is not None:
         raise InputError("has no topics", path=path, advice="name topics only for ROS bags")
-    return reader.read(path, reach=range_max)
+    return reader.read(path, range_max=range_max)
 
 
-def find(path: str | PathLike) -> Path:
+def find_log(path: str | PathLike) -> Path:
     """The path itself, or that of the log of this name in `NAMED_LOGS`, unless such a file exists.
 
     Raises:
-        InputError: It is the name of a log in `NAMED_LOGS`, and the package is not installed.
+        InputError: It is no path, or it is the name of a log in `NAMED_LOGS` and the package is not
+            installed.
     """
+    if not isinstance(path, str | PathLike):
+        raise InputError(f"path is {path!r:.40}", advice="name a file, as text or pathlib.Path")
     name = str(path)
     if Path(path).exists() or name not in NAMED_LOGS:
         return Path(path)

@@ -21,7 +21,9 @@ FORM = (
     "ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m, 3 "
     "numbers of the laser's pose, 3 of the robot's, tv rv forward side axis time host logger_time"
 )
+
 Name = TypeVar("Name")
+"""What scans are numbered or named by."""
 
 
 class RobotLaser(NamedTuple):
@@ -30,9 +32,9 @@ class RobotLaser(NamedTuple):
     Attributes:
         line: Number of its line.
         time: [s].
-        angle_min: [rad] angle_min: direction of the first beam.
-        angle_increment: [rad] angle_increment: from one beam to the next.
-        range_max: [m] range_max.
+        angle_min: [rad] direction of the first beam.
+        angle_increment: [rad] from one beam to the next.
+        range_max: [m] largest range.
         ranges: (R,) float64 [m].
         pose: (3,) [m, m, rad] of the laser, by odometry.
     """
@@ -52,7 +54,6 @@ def parse(line: int, fields: list[bytes]) -> RobotLaser:
     Args:
         line: Number of the line.
         fields: Its fields.
-
 
     Raises:
         InputError: There are too few or too many fields, or one is no number or out of range. It

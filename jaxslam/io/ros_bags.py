@@ -2,8 +2,8 @@
 
 Scans are `sensor_msgs/LaserScan`. Odometry is `nav_msgs/Odometry` or, without such a topic, the
 transform from `odom` to the robot in `/tf`. The pose of the scanner in the robot frame
-(`base_link`) is taken from the transforms; without any, the scanner is at the origin of the robot.
-The poses of the log are those of the scanner.
+(`base_link`) is taken from the transforms; without any, the scanner is at the origin of the
+robot. The poses of the log are those of the scanner.
 """
 
 from collections import Counter
@@ -25,7 +25,7 @@ from jaxslam.core.logs import (
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2_np import compose
 from jaxslam.core.time_series import interpolate_poses
-from jaxslam.io.errors import InputError
+from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.ros_transforms import (
     Transform,
     add_transform,
@@ -95,12 +95,14 @@ def read(
         range_max: Range [m] from which on a reading counts as no return, unless the scanner's own
             range_max is smaller; so does a reading below the scanner's range_min.
         scan_topic: Topic of the laser scans; by default the one with most messages.
-        odometry_topic: Topic of the odometry or of the transforms; by default the one with most messages.
+        odometry_topic: Topic of the odometry or of the transforms; by default the one with most
+            messages.
 
     Raises:
-        InputError: rosbags is not installed, the bag cannot be read or lacks scans or odometry, or
-            more than 5 % of its scans are broken.
+        InputError: `range_max` is not positive, rosbags is not installed, the bag cannot be read or
+            lacks scans or odometry, or more than 5 % of its scans are broken.
     """
+    check_range_max(range_max, infinite=True)
     with _open_bag(Path(path)) as bag:
         chosen = _choose_topics(path, bag, scan_topic, odometry_topic)
         return _build_log(path, chosen, _read_messages(path, bag, chosen), range_max)
@@ -144,7 +146,7 @@ def _choose_topics(
 ) -> Topics:
     """The requested topics; of those not requested, the topic with most messages."""
     types = {connection.topic: connection.msgtype for connection in bag.connections}
-    counts = Counter()
+    counts: Counter[str] = Counter()
     for connection in bag.connections:
         counts[connection.topic] += connection.msgcount
 
@@ -193,7 +195,7 @@ def _read_messages(path: str | PathLike, bag: Any, chosen: Topics) -> _Messages:
                 scans.append(scan)
                 scan_frame = scan_frame or frame_name(message.header.frame_id)
         elif connection.msgtype == ODOMETRY:
-            pose = message.last_pose.last_pose
+            pose = message.pose.pose
             planar = planar_pose(pose.position, pose.orientation)
             base_frame = base_frame or frame_name(message.child_frame_id)
             if np.isfinite(planar).all():

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxslam.core.maps import MAX_CELLS, OccupancyMap
+from jaxslam.core.types import as_float64, check_array
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace, write_text
 from jaxslam.io.text import lines
@@ -85,19 +86,26 @@ def write(path: str | PathLike, occupancy: OccupancyMap) -> None:
         occupancy: The map.
 
     Raises:
+        ValueError: A field of the map is of another shape or type, or not finite.
         InputError: A file cannot be written.
     """
     path = Path(path)
-    shade = np.where(occupancy.occupied, 0, np.where(occupancy.free, 254, 205)).astype(np.uint8)
+    occupied, free = np.asarray(occupancy.occupied), np.asarray(occupancy.free)
+    check_array("occupied", occupied, ("H", "W"), np.bool_)
+    check_array("free", free, occupied.shape, np.bool_)
+    resolution = float(as_float64("resolution", occupancy.resolution, ()))
+    x, y, heading = origin = as_float64("origin", occupancy.origin, (3,)).tolist()
+    if not np.isfinite(origin).all() or not 0.0 < resolution < math.inf:
+        raise ValueError(f"resolution is {resolution} and origin {origin}, not a size and a pose")
+    shade = np.where(occupied, 0, np.where(free, 254, 205)).astype(np.uint8)
     rows = np.ascontiguousarray(shade.T[::-1])
     image = path.with_suffix(".pgm")
     with replace(image) as file:
         file.write(b"P5\n%d %d\n255\n" % rows.shape[::-1] + rows.tobytes())
-    x, y, heading = (float(value) for value in occupancy.origin)
     fields = {
         "image": image.name,
         "mode": "trinary",
-        "resolution": f"{occupancy.resolution!r}",
+        "resolution": f"{resolution!r}",
         "origin": f"[{x!r}, {y!r}, {heading!r}]",
         "negate": "0",
         "occupied_thresh": "0.65",
@@ -128,8 +136,8 @@ def _load(path: Path) -> Mapping[str, Any]:
         raise InputError("PyYAML is needed to read it", path=path, advice=advice) from None
     advice = "name the YAML file of a map, as map_saver writes it"
     text = b""
-    for _, line in lines(path):
-        text += line
+    for _, part in lines(path):
+        text += part
         if len(text) > MAX_YAML_BYTES:
             raise InputError(f"is longer than {MAX_YAML_BYTES} bytes", path=path, advice=advice)
     try:

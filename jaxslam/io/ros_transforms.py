@@ -12,18 +12,26 @@ MAX_TRANSFORMS = 32  # transforms between two frames at most
 
 
 class Transform(NamedTuple):
-    """The pose of a frame in its parent frame over time."""
+    """The pose of a frame in its parent frame over time.
+
+    Attributes:
+        parent: Name of the parent frame.
+        times: [s].
+        values: Translation x y z [m] and quaternion x y z w at each of the times.
+    """
 
     parent: str
-    times: list[float]  # [s]
-    values: list[tuple[float, ...]]  # translation x y z [m], quaternion x y z w
+    times: list[float]
+    values: list[tuple[float, ...]]
 
 
 def seconds(stamp: Any) -> float:
+    """Seconds of a ROS time stamp."""
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def frame_name(frame: str) -> str:
+    """Name of a frame without the slash that ROS 1 puts before it."""
     return frame.removeprefix("/")
 
 
@@ -61,7 +69,18 @@ class _Vector(NamedTuple):
 def odometry_of_transforms(
     path: str | PathLike, transforms: dict[str, Transform]
 ) -> tuple[str, list[tuple[float, float, float, float]]]:
-    """The robot frame, and its times and poses in the odometry frame."""
+    """Odometry by transforms.
+
+    Args:
+        path: The bag, for errors.
+        transforms: Transforms by child frame.
+
+    Returns:
+        Name of the robot frame, and t x y heading [s, m, m, rad] of it in the odometry frame.
+
+    Raises:
+        InputError: No frame has the odometry frame as its parent.
+    """
     for child, transform in transforms.items():
         if transform.parent == ODOM_FRAME:
             poses = [planar_pose(_Vector(*v[:3]), _Vector(*v[3:])) for v in transform.values]
@@ -74,7 +93,17 @@ def odometry_of_transforms(
 def mount_pose(
     transforms: dict[str, Transform], scan_frame: str, base_frame: str
 ) -> tuple[np.ndarray, bool]:
-    """Pose (3,) of the scanner in the robot frame, and whether it is mounted upside down."""
+    """Mount of the scanner.
+
+    Args:
+        transforms: Transforms by child frame; the first value of each is used.
+        scan_frame: Frame of the scans.
+        base_frame: Frame of the robot.
+
+    Returns:
+        Pose (3,) [m, m, rad] of the scanner in the robot frame, and whether it is mounted upside
+        down. Zero and False if no transforms join the two frames.
+    """
     position, rotation = np.zeros(3), np.eye(3)
     frame = scan_frame
     for _ in range(MAX_TRANSFORMS):

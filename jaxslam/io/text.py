@@ -76,13 +76,13 @@ def lines(path: str | PathLike) -> Iterator[tuple[int, bytes]]:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[IO[bytes]]:
+def _open(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
     """Open a file, decompressed."""
     with open(path, "rb") as file:
         head = file.read(4)
     if head[:2] == b"\x1f\x8b":
-        with gzip.open(path, "rb") as file:
-            yield file
+        with gzip.open(path, "rb") as unpacked:
+            yield unpacked
     elif head == b"PK\3\4":
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if not name.endswith("/")]
@@ -90,8 +90,8 @@ def _open(path: Path) -> Iterator[IO[bytes]]:
             if len(names) != 1:
                 problem = f"is a zip archive of {len(names)} files"
                 raise InputError(problem, path=path, advice="unpack it and name one of them")
-            with archive.open(names[0]) as file:
-                yield file
+            with archive.open(names[0]) as member:
+                yield member
     else:
         with open(path, "rb") as file:
             yield file
@@ -168,7 +168,7 @@ def table(path: str | PathLike, names: Sequence[str], form: str) -> tuple[np.nda
         values = np.loadtxt([text for _, text in kept], comments=None, ndmin=2) if kept else None
     except ValueError:
         values = None
-    if values is None or values.shape[1] != len(names) or not np.isfinite(values).all():
-        kept = rows(path, names, form)  # raises with the line that is broken
-        values = np.array([row for _, row in kept])
-    return np.array([line for line, _ in kept]), values
+    if values is not None and values.shape[1] == len(names) and np.isfinite(values).all():
+        return np.array([line for line, _ in kept]), values
+    parsed = rows(path, names, form)  # raises with the line that is broken
+    return np.array([line for line, _ in parsed]), np.array([row for _, row in parsed])

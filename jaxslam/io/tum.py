@@ -5,6 +5,7 @@ from os import PathLike
 
 import numpy as np
 
+from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_text
 from jaxslam.io.text import rows
@@ -23,19 +24,19 @@ def read(path: str | PathLike) -> tuple[np.ndarray, np.ndarray]:
             last four are a unit quaternion.
     """
     table = rows(path, FIELDS, "a TUM trajectory")
-    for line, values in table:
-        norm = math.hypot(*values[4:])
+    for line, fields in table:
+        norm = math.hypot(*fields[4:])
         if abs(norm - 1.0) > 1e-2:
             problem = f"quaternion of length {norm:.3g} instead of 1"
             advice = "the last four fields are qx qy qz qw"
             raise InputError(problem, path=path, line=line, field="qx qy qz qw", advice=advice)
-    values = np.array([values for _, values in table])
+    values = np.array([fields for _, fields in table])
     x, y, z, w = (values[:, 4:] / np.linalg.norm(values[:, 4:], axis=1, keepdims=True)).T
     heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return values[:, 0].copy(), np.column_stack([values[:, 1:3], heading])
 
 
-def write(path: str | PathLike, times: np.ndarray, poses: np.ndarray) -> None:
+def write(path: str | PathLike, times: AnyArray, poses: AnyArray) -> None:
     """Write a trajectory; every number is read back exactly.
 
     Args:
@@ -44,12 +45,11 @@ def write(path: str | PathLike, times: np.ndarray, poses: np.ndarray) -> None:
         poses: (N, 3) [m, m, rad].
 
     Raises:
-        InputError: The shapes do not match, a pose is not finite, or the file cannot be written.
+        ValueError: An argument is not numbers of its shape.
+        InputError: A pose is not finite, or the file cannot be written.
     """
-    times, poses = np.asarray(times, np.float64), np.asarray(poses, np.float64)
-    if times.ndim != 1 or poses.shape != (times.size, 3):
-        problem = f"times {times.shape} and poses {poses.shape} are not (N,) and (N, 3)"
-        raise InputError(problem, path=path)
+    times = as_float64("times", times, ("N",))
+    poses = as_float64("poses", poses, (times.size, 3))
     not_finite = ~np.isfinite(np.column_stack([times, poses])).all(axis=1)
     if not_finite.any():
         problem = f"pose {int(np.argmax(not_finite))} is not finite"

@@ -1,1 +1,17 @@
-"""TODO."""
+"""Maps: the global topological map, routes over it, occupancy map, pose graph, grid topology."""
+
+from jaxslam.core.maps import OccupancyMap as OccupancyMap
+from jaxslam.core.maps import TopologicalMap as TopologicalMap
+from jaxslam.mapping.arc_table import ArcTable as ArcTable
+from jaxslam.mapping.arc_table import add_scan_arcs as add_scan_arcs
+from jaxslam.mapping.arc_table import empty_arcs as empty_arcs
+from jaxslam.mapping.arc_table import grow_arcs as grow_arcs
+from jaxslam.mapping.grid_topology import GridTopology as GridTopology
+from jaxslam.mapping.grid_topology import extract_topology as extract_topology
+from jaxslam.mapping.occupancy import occupancy_map as occupancy_map
+from jaxslam.mapping.pose_graph import PoseGraph as PoseGraph
+from jaxslam.mapping.pose_graph import build_pose_graph as build_pose_graph
+from jaxslam.mapping.routes import Route as Route
+from jaxslam.mapping.routes import find_route as find_route
+from jaxslam.mapping.routes import shortest_path as shortest_path
+from jaxslam.mapping.topological_map import build_map as build_map

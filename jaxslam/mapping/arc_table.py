@@ -5,29 +5,26 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from numpy.typing import ArrayLike
 
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import inverse_transform, transform, unit_vector
-from jaxslam.core.types import Array
+from jaxslam.core.types import Array, as_float, check_array
 from jaxslam.filtering.map_management import claim_slots
 from jaxslam.frontend.arc_tracing import POLYLINE_POINTS
 from jaxslam.frontend.lidar import in_free_view
 from jaxslam.frontend.local_graph import SAME_ARC_DISTANCE, LocalArcs, polyline_gap, repeats_earlier
 from jaxslam.mapping.polyline_transport import attach_polyline
 
-FRONTIER_RADIUS = (
-    0.4  # [m] radius around the end of a frontier that must be observed to call it explored
-)
+# [m] radius around the end of a frontier that must be observed to call it explored
+FRONTIER_RADIUS = 0.4
 WALL_SKIN = 0.2  # [m] assumed thickness of a wall behind the point that a beam hit
-SAME_FRONTIER_DISTANCE = (
-    1.0  # [m] two frontiers of one node with ends closer than this are the same
-)
-MAX_FRONTIERS_CHECKED = (
-    64  # frontiers whose surroundings are checked in one scan at most, the nearest ones
-)
-MAX_PARALLEL_ARCS = (
-    8  # stored arcs with the same ends that one arc of a scan is compared with at most
-)
+# [m] two frontiers of one node with ends closer than this are the same
+SAME_FRONTIER_DISTANCE = 1.0
+# Largest number of frontiers whose surroundings are checked in one scan, the nearest ones.
+MAX_FRONTIERS_CHECKED = 64
+# Largest number of stored arcs with the same ends that one arc of a scan is compared with.
+MAX_PARALLEL_ARCS = 8
 
 
 class ArcTable(NamedTuple):
@@ -100,7 +97,16 @@ class _Match(NamedTuple):
 
 
 def empty_arcs(*, capacity: int) -> ArcTable:
-    """Map without arcs, with a capacity of `capacity` slots."""
+    """Map without arcs.
+
+    Args:
+        capacity: A, number of slots.
+
+    Raises:
+        ValueError: The capacity is not at least 1.
+    """
+    if capacity < 1:
+        raise ValueError(f"capacity is {capacity}, not a number of slots >= 1")
     return ArcTable(
         ends=jnp.full((capacity, 2), -1, jnp.int32),
         polyline=jnp.zeros((capacity, POLYLINE_POINTS, 2)),
@@ -118,7 +124,7 @@ def grow_arcs(arcs: ArcTable, capacity: int) -> ArcTable:
 
 
 def add_scan_arcs(
-    lidar: Lidar, arcs: ArcTable, ids: Array, pose: Array, local_arcs: LocalArcs, scan: Scan
+    lidar: Lidar, arcs: ArcTable, ids: ArrayLike, pose: ArrayLike, local_arcs: LocalArcs, scan: Scan
 ) -> ArcTable:
     """Merge the arcs observed in one scan into the map.
 
@@ -127,7 +133,8 @@ def add_scan_arcs(
     the estimate has drifted since, as both polylines have the same end points:
 
            .-~~-.   observed            stored, transported: largest distance of corresponding
-      a  o'------'o  b                  points < `SAME_ARC_DISTANCE`: the same arc, take the running mean
+      a  o'------'o  b                  points < `SAME_ARC_DISTANCE`: the same arc, so take the
+                                        running mean
 
            .-~~-.   observed
       a  o        o  b                  the robot passed an obstacle on the other side:
@@ -137,12 +144,12 @@ def add_scan_arcs(
     frontier is dropped once the surroundings of its end have been observed.
 
     Args:
+        lidar: The scanner.
         arcs: The map so far, A slots.
-        ids: (M,) int32 landmark id of each feature of the scan, -1 for none.
+        ids: (M,) int landmark id of each feature of the scan, -1 for none.
         pose: (3,) [m, m, rad] estimated pose of the scan, map frame.
         local_arcs: Branches of the scan's Voronoi diagram, P, robot frame.
         scan: The scan.
-        lidar: The scanner.
 
     Returns:
         The map with this scan. New arcs beyond its capacity are dropped.
@@ -150,7 +157,7 @@ def add_scan_arcs(
     Raises:
         ValueError: An argument has another shape or type; while tracing.
     """
-    _check(ids, pose, local_arcs, scan, lidar)
+    arcs, ids, pose, local_arcs, scan = _checked(lidar, arcs, ids, pose, local_arcs, scan)
     arcs = _clear_slots(arcs, _explored_frontiers(arcs, pose, scan, lidar))
     observed = _arcs_of_scan(ids, pose, local_arcs, arcs.polyline.dtype)
     match = _best_candidate(_candidates(arcs, observed))
@@ -162,33 +169,52 @@ def add_scan_arcs(
     )
 
 
-def _check(ids: Array, pose: Array, links: LocalArcs, scan: Scan, lidar: Lidar) -> None:
-    """Raise ValueError if shapes or types do not fit."""
-    if ids.ndim != 1 or not jnp.issubdtype(ids.dtype, jnp.integer):
-        raise ValueError(f"ids is {ids.dtype} {ids.shape}, not integers (M,)")
-    count = links.valid.shape[0]
-    for name, array, shape in (
-        ("pose", pose, (3,)),
-        ("links.pair", links.pair, (count, 2)),
-        ("links.line", links.polyline, (count, POLYLINE_POINTS, 2)),
-        ("scan.ranges", scan.ranges, (lidar.num_beams,)),
+def _checked(
+    lidar: Lidar, arcs: ArcTable, ids: ArrayLike, pose: ArrayLike, local_arcs: LocalArcs, scan: Scan
+) -> tuple[ArcTable, Array, Array, LocalArcs, Scan]:
+    """The arguments of `add_scan_arcs` as JAX arrays; ValueError if shapes or types do not fit."""
+    for name, record, kind in (
+        ("lidar", lidar, Lidar),
+        ("arcs", arcs, ArcTable),
+        ("local_arcs", local_arcs, LocalArcs),
+        ("scan", scan, Scan),
     ):
-        if array.shape != shape:
-            raise ValueError(f"{name} is {array.shape}, not {shape}")
+        if not isinstance(record, kind):
+            raise ValueError(f"{name} is of type {type(record).__name__}, not {kind.__name__}")
+    arcs, ids = jax.tree.map(jnp.asarray, arcs), jnp.asarray(ids)
+    pair, valid, hit = map(jnp.asarray, (local_arcs.pair, local_arcs.valid, scan.hit))
+    count, beams = valid.size, lidar.num_beams
+    check_array("arcs.polyline", arcs.polyline, ("A", POLYLINE_POINTS, 2), jnp.floating)
+    check_array("ids", ids, ("M",), jnp.integer)
+    check_array("local_arcs.valid", valid, (count,), jnp.bool_)
+    check_array("local_arcs.pair", pair, (count, 2), jnp.integer)
+    check_array("scan.hit", hit, (beams,), jnp.bool_)
+    polyline_shape = (count, POLYLINE_POINTS, 2)
+    local_arcs = LocalArcs(
+        pair=pair.astype(jnp.int32),
+        polyline=as_float("local_arcs.polyline", local_arcs.polyline, polyline_shape),
+        length=as_float("local_arcs.length", local_arcs.length, (count,)),
+        clearance=as_float("local_arcs.clearance", local_arcs.clearance, (count,)),
+        valid=valid,
+    )
+    pose = as_float("pose", pose, (3,))
+    scan = Scan(as_float("scan.ranges", scan.ranges, (beams,)), hit)
+    return arcs, ids.astype(jnp.int32), pose, local_arcs, scan
 
 
 def _explored_frontiers(arcs: ArcTable, pose: Array, scan: Scan, lidar: Lidar) -> Array:
-    """Slots (AROUND,) int32 of the frontiers that a scan has explored; A for none.
+    """Slots (F,) int32 of the frontiers that a scan has explored; A for none.
 
-    The end E of a frontier is explored if E and eight points on a circle of radius `FRONTIER_RADIUS` around
-    it are observed: free (before the ends of the two neighbouring beams) or wall (up to `WALL_SKIN`
-    behind a hit).
+    The end E of a frontier is explored if E and eight points on a circle of radius
+    `FRONTIER_RADIUS` around it are observed: free (before the ends of the two neighbouring beams)
+    or wall (up to `WALL_SKIN` behind a hit).
 
          node o--------- E          .  .       all eight points observed: nothing
                                  .  E   .      unknown is left to explore here
                                    .  .
 
-    Few ends are in view, so the circle is computed for the `MAX_FRONTIERS_CHECKED` nearest of them only.
+    Few ends are in view, so the circle is computed for the nearest of them only, F =
+    `MAX_FRONTIERS_CHECKED`.
     """
     capacity = arcs.num_seen.size
     depth = scan.ranges + jnp.where(scan.hit, WALL_SKIN, 0.0).astype(scan.ranges.dtype)
@@ -199,7 +225,7 @@ def _explored_frontiers(arcs: ArcTable, pose: Array, scan: Scan, lidar: Lidar) -
     circle = FRONTIER_RADIUS * unit_vector(
         jnp.linspace(-jnp.pi, jnp.pi, 8, endpoint=False, dtype=pose.dtype)
     )
-    circle = inverse_transform(pose, circle[None] + arcs.polyline[slot, -1:])  # (AROUND, 8, 2)
+    circle = inverse_transform(pose, circle[None] + arcs.polyline[slot, -1:])  # (F, 8, 2)
     explored = (score > -jnp.inf) & jnp.all(in_free_view(lidar, circle, depth), axis=1)
     return jnp.where(explored, slot, capacity).astype(jnp.int32)
 
@@ -212,29 +238,30 @@ def _clear_slots(arcs: ArcTable, slot: Array) -> ArcTable:
     )
 
 
-def _arcs_of_scan(ids: Array, pose: Array, links: LocalArcs, dtype: jnp.dtype) -> _ScanArcs:
+def _arcs_of_scan(ids: Array, pose: Array, local_arcs: LocalArcs, dtype: jnp.dtype) -> _ScanArcs:
     """Branches of a scan as arcs between landmarks in the map frame, the smaller id first.
 
     Valid are those whose ends are two different landmarks (one, at a frontier), whose polyline is
     finite, and which do not repeat an earlier one of the same scan.
     """
-    frontier = links.pair[:, 1] < 0
-    ends = jnp.where(links.pair < 0, -1, ids[links.pair])
-    line = transform(pose, links.polyline).astype(dtype)
+    frontier = local_arcs.pair[:, 1] < 0
+    ends = jnp.where(local_arcs.pair < 0, -1, ids[local_arcs.pair])
+    line = transform(pose, local_arcs.polyline).astype(dtype)
     swap = ~frontier & (ends[:, 0] > ends[:, 1])
     ends = jnp.where(swap[:, None], ends[:, ::-1], ends)
     line = jnp.where(swap[:, None, None], line[:, ::-1], line)
-    valid = links.valid & (ends[:, 0] >= 0) & (frontier | (ends[:, 1] >= 0))
+    valid = local_arcs.valid & (ends[:, 0] >= 0) & (frontier | (ends[:, 1] >= 0))
     valid &= (ends[:, 0] != ends[:, 1]) & jnp.all(jnp.isfinite(line), axis=(1, 2))
     valid &= ~repeats_earlier(ends, line, valid)
-    return _ScanArcs(ends, line, links.length, links.clearance, frontier, valid)
+    return _ScanArcs(ends, line, local_arcs.length, local_arcs.clearance, frontier, valid)
 
 
 def _candidates(arcs: ArcTable, observed: _ScanArcs) -> _Candidates:
     """Stored arcs with the same ends, transported onto each observed arc, and how far they are off.
 
     A stored frontier has one landmark only: it is translated to start there and keeps its end. The
-    distance between the ends of two frontiers is scaled, so that `SAME_ARC_DISTANCE` is the gate for both kinds.
+    distance between the ends of two frontiers is scaled, so that `SAME_ARC_DISTANCE` is the gate
+    for both kinds.
     """
     line, frontier = observed.line, observed.frontier
     same_ends = (observed.ends[:, :1] == arcs.ends[None, :, 0]) & (

@@ -38,9 +38,6 @@ class CellGraph(NamedTuple):
     arcs: dict[int, CellArc]
 
 
-# Trace thin cells into a graph.
-
-
 def trace_cells(cells: np.ndarray, clearance: np.ndarray) -> CellGraph:
     """Graph of thin cells.
 

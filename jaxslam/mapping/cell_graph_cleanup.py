@@ -4,15 +4,10 @@ import numpy as np
 
 from jaxslam.mapping.cell_graph import CellArc, CellGraph, make_arc
 
-CORNER_SPUR_FACTOR = (
-    1.6  # a spur into a right corner is 1.41 times as long as its clearance decreases
-)
-MERGE_FRACTION = (
-    0.5  # junctions closer than this fraction of the smaller of their clearances are merged
-)
-
-
-# Clean up the graph.
+# A spur into a right corner is 1.41 times as long as its clearance decreases.
+CORNER_SPUR_FACTOR = 1.6
+# Junctions closer than this fraction of the smaller of their clearances are merged.
+MERGE_FRACTION = 0.5
 
 
 def arcs_at_nodes(cell_graph: CellGraph) -> dict[int, list[int]]:
@@ -36,6 +31,10 @@ def clean_up(cell_graph: CellGraph, clearance: np.ndarray) -> None:
 
     Dropping a spur may leave a node of degree 2, and joining there may leave a new spur at the
     next junction, so these two alternate first.
+
+    Args:
+        cell_graph: The graph; changed in place.
+        clearance: (H, W) [cells] distance to the nearest obstacle.
     """
     before = None
     while before != len(cell_graph.arcs):
@@ -50,8 +49,12 @@ def drop_spurs(cell_graph: CellGraph, clearance: np.ndarray) -> bool:
     """Drop spurs no longer than the clearance at their root, or into a corner; was any dropped?
 
     A spur into a corner loses clearance at a constant rate along its length: it is no longer than
-    `CORNER_SPUR_FACTOR` times the difference between root and tip. All spurs are dropped at once, so that of
-    the two spurs into the corners of a dead end neither becomes its end.
+    `CORNER_SPUR_FACTOR` times the difference between root and tip. All spurs are dropped at once,
+    so that of the two spurs into the corners of a dead end neither becomes its end.
+
+    Args:
+        cell_graph: The graph; changed in place.
+        clearance: (H, W) [cells] distance to the nearest obstacle.
     """
     arcs_at = arcs_at_nodes(cell_graph)
     short: dict[int, int] = {}  # tip of each short spur

@@ -1,4 +1,4 @@
-"""Arcs of a topological map as polylines: split, merge, shortest path, driven arcs; NumPy."""
+"""Arcs of a topological map as polylines: split, merged, driven, open frontiers; NumPy, host."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,19 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core import polylines
-from jaxslam.core.polylines import cumulative_lengths, project, resample_np
-from jaxslam.mapping.routes import shortest_path
+from jaxslam.core.polylines import cumulative_lengths, project, resample
+from jaxslam.mapping.routes import find_path
 
-FOLLOW_DISTANCE = (
-    1.0  # [m] a drive this close to known arcs follows them; more where clearances are larger
-)
+# [m] a drive this close to known arcs follows them; more where clearances are larger
+FOLLOW_DISTANCE = 1.0
 MAX_DETOUR = 1.5, 0.5  # [-, m] factor and offset by which followed arcs may be longer than a drive
-FRONTIER_TOLERANCE = (
-    0.5  # [m] the end of a frontier this close to an arc, or to another's end, is reached
-)
-PASS_FRACTION = (
-    0.7  # an arc passes through a node if closer than this fraction of the node-to-end distance
-)
+# [m] the end of a frontier this close to an arc, or to another's end, is reached
+FRONTIER_TOLERANCE = 0.5
+# An arc passes through a node if closer than this fraction of the node-to-end distance.
+PASS_FRACTION = 0.7
 MIN_ARC_LENGTH = 0.1  # [m] no piece shorter than this is split off
 
 
@@ -28,7 +25,7 @@ class Arc(NamedTuple):
     Attributes:
         start: Index of the first node.
         end: Index of the last node, -1 at a frontier.
-        polyline: (n >= 2, 2) [m] polyline from `a` to `b`, map frame.
+        polyline: (n >= 2, 2) [m] from the first node to the last, map frame.
         length: [m].
         clearance: [m] smallest distance to an obstacle along the arc, NaN if not known.
         num_seen: Number of observations.
@@ -42,12 +39,12 @@ class Arc(NamedTuple):
     num_seen: int
 
 
-def reverse(way: Arc) -> Arc:
+def reverse(arc: Arc) -> Arc:
     """The same arc, from its last node to its first."""
-    return way._replace(start=way.end, end=way.start, polyline=way.polyline[::-1])
+    return arc._replace(start=arc.end, end=arc.start, polyline=arc.polyline[::-1])
 
 
-def split_at_nodes(way: Arc, xy: np.ndarray, near: np.ndarray) -> list[Arc]:
+def split_at_nodes(arc: Arc, xy: np.ndarray, radius: np.ndarray) -> list[Arc]:
     """Pieces of an arc between the nodes that it passes through.
 
                     c
@@ -56,31 +53,31 @@ def split_at_nodes(way: Arc, xy: np.ndarray, near: np.ndarray) -> list[Arc]:
             one arc (a, b)                   two arcs (a, c), (c, b)
 
     Args:
-        way: An arc or a frontier.
+        arc: An arc or a frontier.
         xy: (N, 2) [m] positions of the nodes.
-        near: (N,) [m] the arc passes through a node if it comes closer than this.
+        radius: (N,) [m] the arc passes through a node if it comes closer than this.
 
     Returns:
-        The pieces in order, each at least `MIN_ARC_LENGTH` long; the arc itself if it is not split. The
-        length of the arc is shared in proportion.
+        The pieces in order, each at least `MIN_ARC_LENGTH` long; the arc itself if it is not split.
+        The length of the arc is shared in proportion.
     """
-    nodes, at_node = _passed_nodes(way, xy, near)
+    nodes, at_node = _passed_nodes(arc, xy, radius)
     if not nodes.size:
-        return [way]
-    at_point, whole = cumulative_lengths(way.polyline), polylines.length(way.polyline)
+        return [arc]
+    at_point, whole = cumulative_lengths(arc.polyline), polylines.length(arc.polyline)
     cuts = [0.0, *at_node, whole]
-    names = [way.start, *map(int, nodes), way.end]
-    corners = [way.polyline[0], *xy[nodes], way.polyline[-1]]
+    names = [arc.start, *map(int, nodes), arc.end]
+    corners = [arc.polyline[0], *xy[nodes], arc.polyline[-1]]
     pieces = []
     for k in range(len(cuts) - 1):
-        inner = way.polyline[
+        inner = arc.polyline[
             (at_point > cuts[k] + MIN_ARC_LENGTH) & (at_point < cuts[k + 1] - MIN_ARC_LENGTH)
         ]
         line = np.concatenate([corners[k][None], inner, corners[k + 1][None]])
         if polylines.length(line) > MIN_ARC_LENGTH:
-            length = polylines.length(line) * way.length / whole
+            length = polylines.length(line) * arc.length / whole
             pieces.append(
-                way._replace(start=names[k], end=names[k + 1], polyline=line, length=length)
+                arc._replace(start=names[k], end=names[k + 1], polyline=line, length=length)
             )
     return pieces
 
@@ -88,9 +85,9 @@ def split_at_nodes(way: Arc, xy: np.ndarray, near: np.ndarray) -> list[Arc]:
 def _passed_nodes(arc: Arc, xy: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inner nodes that an arc passes through, in order, and the lengths (P,) [m] at which it does.
 
-    A node is passed if the arc comes closer to it than its radius and than `PASS_FRACTION` of its distance
-    to the ends of the arc: a node beside an end is not on the arc. A node at the open end of a
-    frontier is passed too.
+    A node is passed if the arc comes closer to it than its radius and than `PASS_FRACTION` of its
+    distance to the ends of the arc: a node beside an end is not on the arc. A node at the open end
+    of a frontier is passed too.
     """
     whole, margin = polylines.length(arc.polyline), radius[:, None]
     in_box = (arc.polyline.min(axis=0) - margin < xy) & (xy < arc.polyline.max(axis=0) + margin)
@@ -106,22 +103,22 @@ def _passed_nodes(arc: Arc, xy: np.ndarray, radius: np.ndarray) -> tuple[np.ndar
     return nodes[order], at_node[order]
 
 
-def merge_parallel(ways: Sequence[Arc], apart: float) -> list[Arc]:
+def merge_parallel(arcs: Sequence[Arc], max_distance: float) -> list[Arc]:
     """Merge duplicates: arcs with the same ends whose polylines are close to each other.
 
     Of duplicates the one observed most often is kept, with the smallest clearance and the number
     of observations of all.
 
     Args:
-        ways: Arcs.
-        apart: [m] two arcs are duplicates if corresponding points are closer than this.
+        arcs: The arcs.
+        max_distance: [m] two arcs are duplicates if corresponding points are closer than this.
     """
     merged: list[Arc] = []
     with_ends: dict[tuple[int, int], list[int]] = {}  # indices into `merged`
-    for arc in sorted(ways, key=lambda arc: -arc.num_seen):
+    for arc in sorted(arcs, key=lambda arc: -arc.num_seen):
         rivals = with_ends.setdefault((min(arc.start, arc.end), max(arc.start, arc.end)), [])
         for k in rivals:
-            if _are_duplicates(arc, merged[k], apart):
+            if _are_duplicates(arc, merged[k], max_distance):
                 clearance = float(np.fmin(merged[k].clearance, arc.clearance))
                 count = merged[k].num_seen + arc.num_seen
                 merged[k] = merged[k]._replace(clearance=clearance, num_seen=count)
@@ -132,8 +129,8 @@ def merge_parallel(ways: Sequence[Arc], apart: float) -> list[Arc]:
     return merged
 
 
-def _are_duplicates(arc: Arc, other: Arc, apart: float) -> bool:
-    """Whether two arcs between the same nodes are less than `apart` [m] from each other.
+def _are_duplicates(arc: Arc, other: Arc, max_distance: float) -> bool:
+    """Whether two arcs between the same nodes are less than `max_distance` [m] from each other.
 
     Arcs are compared in the direction in which their ends agree; loops, in both.
     """
@@ -142,21 +139,19 @@ def _are_duplicates(arc: Arc, other: Arc, apart: float) -> bool:
         for each in (arc, reverse(arc))
         if (each.start, each.end) == (other.start, other.end)
     ]
-    gaps = [
-        np.linalg.norm(resample_np(line) - resample_np(other.polyline), axis=1) for line in lines
-    ]
-    return any(gap.max() < apart for gap in gaps)
+    gaps = [np.linalg.norm(resample(line) - resample(other.polyline), axis=1) for line in lines]
+    return any(gap.max() < max_distance for gap in gaps)
 
 
-def node_at(place: np.ndarray, xy: np.ndarray, clearance: np.ndarray) -> int:
+def node_at(position: np.ndarray, xy: np.ndarray, clearance: np.ndarray) -> int:
     """Node whose circle contains a position, the nearest where circles overlap; -1 for none.
 
     Args:
-        place: (2,) [m] the position.
+        position: (2,) [m] the position.
         xy: (N, 2) [m] positions of the nodes.
         clearance: (N,) [m] radii of their circles.
     """
-    distance = np.linalg.norm(xy - place, axis=1)
+    distance = np.linalg.norm(xy - position, axis=1)
     inside = np.where(distance < clearance, distance, np.inf)
     return int(np.argmin(inside)) if np.isfinite(inside).any() else -1
 
@@ -182,14 +177,14 @@ def driven_arcs(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> lis
         if node >= 0 and last_node >= 0 and (node != last_node or step > left_at + 1):
             line = np.concatenate([xy[[last_node]], positions[left_at : step + 1], xy[[node]]])
             driven.append(
-                Arc(last_node, node, resample_np(line), float(polylines.length(line)), np.nan, 1)
+                Arc(last_node, node, resample(line), float(polylines.length(line)), np.nan, 1)
             )
         if node >= 0:
             last_node, left_at = node, step
     return driven
 
 
-class _ArcTable(NamedTuple):
+class _KnownArcs(NamedTuple):
     """Known arcs as arrays, with capacity for those to come; written row by row.
 
     Attributes:
@@ -211,20 +206,20 @@ def _box(line: np.ndarray) -> np.ndarray:
     return np.concatenate([line.min(axis=0), -line.max(axis=0)])
 
 
-def _write_row(table: _ArcTable, row: int, arc: Arc) -> None:
+def _write_row(table: _KnownArcs, row: int, arc: Arc) -> None:
     """Write an arc to a row of the table, in place."""
     table.pairs[row], table.lengths[row] = (arc.start, arc.end), arc.length
     table.boxes[row] = _box(arc.polyline)
 
 
 def add_driven_arcs(
-    known: Sequence[Arc], driven: Sequence[Arc], clearance: np.ndarray, apart: float
+    known: Sequence[Arc], driven: Sequence[Arc], clearance: np.ndarray, min_distance: float
 ) -> list[Arc]:
     """Known arcs, and those driven arcs that follow none of them.
 
     A driven arc follows known arcs if these lead from its first node to its last, are about as
-    short, and lie beside it. A driven loop is an arc if it went around something and no known loop
-    lies beside it.
+    short, and run beside it. A driven loop is an arc if it went around something and no known loop
+    runs beside it.
 
              .----- known -----.
           a o                   o b       follows: beside the known arc, nothing is added
@@ -239,17 +234,17 @@ def add_driven_arcs(
         known: Observed arcs.
         driven: Driven arcs, as of `driven_arcs`.
         clearance: (N,) [m] of the nodes.
-        apart: [m] a loop went around something if its outward and return parts are somewhere more
-            than twice this apart.
+        min_distance: [m] a loop went around something if its outward and return parts are somewhere
+            more than twice this from each other.
     """
     known, capacity = list(known), len(known) + len(driven)
-    table = _ArcTable(np.zeros((capacity, 2), int), np.zeros(capacity), np.zeros((capacity, 4)))
+    table = _KnownArcs(np.zeros((capacity, 2), int), np.zeros(capacity), np.zeros((capacity, 4)))
     for row, arc in enumerate(known):
         _write_row(table, row, arc)
     for drive in driven:
         radius = max(FOLLOW_DISTANCE, clearance[drive.start], clearance[drive.end])
         if drive.start == drive.end:
-            is_new = _is_new_loop(drive, known, radius, apart)
+            is_new = _is_new_loop(drive, known, radius, min_distance)
         else:
             is_new = not _follows(drive, known, table, radius, len(clearance))
         if is_new:
@@ -258,30 +253,28 @@ def add_driven_arcs(
     return known
 
 
-def _is_new_loop(drive: Arc, known: Sequence[Arc], radius: float, apart: float) -> bool:
-    """Whether a driven loop encloses something and lies beside no known loop of its node."""
-    if not np.linalg.norm(drive.polyline - drive.polyline[::-1], axis=1).max() > 2 * apart:
+def _is_new_loop(drive: Arc, known: Sequence[Arc], radius: float, min_distance: float) -> bool:
+    """Whether a driven loop encloses something and runs beside no known loop of its node."""
+    if not np.linalg.norm(drive.polyline - drive.polyline[::-1], axis=1).max() > 2 * min_distance:
         return False
     loops = [arc.polyline for arc in known if arc.start == arc.end == drive.start]
     return all(project(drive.polyline, loop)[0].max() > radius for loop in loops)
 
 
 def _follows(
-    drive: Arc, known: Sequence[Arc], table: _ArcTable, radius: float, num_nodes: int
+    drive: Arc, known: Sequence[Arc], table: _KnownArcs, radius: float, num_nodes: int
 ) -> bool:
     """Whether a path over known arcs, all within `radius` [m] of a drive, replaces the drive."""
     count = len(known)
     close = np.all(table.boxes[:count] >= _box(drive.polyline) - radius, axis=1)
-    for k in np.flatnonzero(close):
+    for k in np.flatnonzero(close).tolist():
         close[k] = project(known[k].polyline, drive.polyline)[0].max() < radius
     usable = np.where(close, table.lengths[:count], np.inf)
-    try:
-        path = shortest_path(
-            table.pairs[:count], usable, drive.start, drive.end, num_nodes=num_nodes
-        )
-    except ValueError:
-        return False
-    return not table.lengths[path].sum() > MAX_DETOUR[0] * drive.length + MAX_DETOUR[1]
+    path = find_path(table.pairs[:count], usable, drive.start, drive.end, num_nodes=num_nodes)
+    return (
+        path is not None
+        and not table.lengths[path].sum() > MAX_DETOUR[0] * drive.length + MAX_DETOUR[1]
+    )
 
 
 def open_frontiers(
@@ -305,7 +298,7 @@ def open_frontiers(
         at_node = np.linalg.norm(xy - end, axis=1) < clearance / 2
         at_node[frontier.start] = False
         in_box = ((low - radius <= end) & (end <= high + radius)).all(axis=1)
-        nearby = [known[k].polyline for k in np.flatnonzero(in_box)]
+        nearby = [known[k].polyline for k in np.flatnonzero(in_box).tolist()]
         on_arc = any(project(end, line)[0][0] < radius for line in nearby)
         duplicate = any(
             np.linalg.norm(other.polyline[-1] - end[0]) < FRONTIER_TOLERANCE for other in kept

@@ -1,29 +1,31 @@
 """Topological map of an occupancy grid: the medial cells of free space as a graph.
 
-Nodes are the junctions and dead ends of the medial cells, arcs the paths of cells between them.
+Its nodes are the junctions and dead ends of the medial cells, its arcs the paths of cells between.
 Two nodes may be joined by several arcs, and a ring without a junction is one node with a loop.
 
-    medial cells (`medial_axis`) -> trace into a graph of cells -> clean up: drop short spurs, join arcs
-    through nodes of degree 2, merge close junctions -> polylines in the map frame
+    medial cells (`medial_axis`) -> trace into a graph of cells (`cell_graph`)
+    -> clean up: drop short spurs, join arcs through nodes of degree 2, merge close junctions
+       (`cell_graph_cleanup`) -> polylines in the map frame
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jaxslam.core import polylines
 from jaxslam.core.maps import TopologicalMap
-from jaxslam.core.types import JUNCTION
+from jaxslam.core.types import JUNCTION, as_float64, check_array
 from jaxslam.mapping import medial_axis
 from jaxslam.mapping.cell_graph import CellGraph, trace_cells
 from jaxslam.mapping.cell_graph_cleanup import clean_up
 from jaxslam.mapping.medial_axis import FreeConfigurations
 
-DEAD_END_ANGLE = np.radians(
-    120.0
-)  # obstacles seen under a larger angle make dead ends; corners do not
+# Obstacles seen under a larger angle make dead ends; corners do not.
+DEAD_END_ANGLE = np.radians(120.0)
 STAGES = ("distances", "thinning", "graph")
 UNKNOWN_MARGIN = 2  # [cells] unknown cells this close to an occupied one are part of the wall
 
@@ -45,11 +47,11 @@ class GridTopology(NamedTuple):
 
 
 def extract_topology(
-    occupied: np.ndarray,
-    free: np.ndarray,
+    occupied: ArrayLike,
+    free: ArrayLike,
     *,
     resolution: float,
-    origin: np.ndarray,
+    origin: ArrayLike,
     robot_radius: float,
     min_obstacle_size: float = 0.1,
     min_region_area: float | None = None,
@@ -67,16 +69,21 @@ def extract_topology(
         free: (H, W) bool; a cell that is neither is unknown.
         resolution: [m] side of a cell.
         origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
-        robot_radius: [m] radius of the robot. Nodes keep this distance from what is not free; so do
-            arcs, but for less than a cell where the simplified polyline cuts a bend.
-            `arc_clearance` is that of the polyline.
+        robot_radius: [m] The nodes keep this distance from what is not free; so do arcs, but for
+            less than a cell where the simplified polyline cuts a bend. `arc_clearance` is that of
+            the polyline.
         min_obstacle_size: [m] obstacles in free space no wider than this are noise.
         min_region_area: [m^2] smallest region that is mapped; None for the largest region alone.
         callback: Callback, called with the name of each of the `STAGES` as it begins.
 
     Raises:
-        ValueError: The robot fits nowhere.
+        ValueError: The robot fits nowhere, or an argument has another type, shape or range.
     """
+    occupied, free = np.asarray(occupied), np.asarray(free)
+    check_array("occupied", occupied, ("H", "W"), jnp.bool_)
+    check_array("free", free, occupied.shape, jnp.bool_)
+    origin = as_float64("origin", origin, (3,))
+    _check_sizes(resolution, robot_radius, min_obstacle_size, min_region_area)
     callback(STAGES[0])
     free = medial_axis.free_space(
         occupied,
@@ -87,7 +94,7 @@ def extract_topology(
     space = medial_axis.free_configurations(free, clearance=robot_radius / resolution)
     areas = space.region_sizes * resolution**2
     if not areas.size:
-        raise ValueError(f"has no free space for a robot with a clearance of {robot_radius:g} m")
+        raise ValueError(f"has no free space for a robot with robot_radius = {robot_radius:g} m")
     count = 1 if min_region_area is None else max(1, int(np.sum(areas >= min_region_area)))
     chosen = (space.region > 0) & (space.region <= count)
     wall = ndimage.binary_dilation(occupied, structure=np.ones((3, 3)), iterations=UNKNOWN_MARGIN)
@@ -97,11 +104,23 @@ def extract_topology(
     callback(STAGES[2])
     cell_graph = trace_cells(cells, space.distance)
     clean_up(cell_graph, space.distance)
-    graph = _to_map(cell_graph, space, resolution, np.asarray(origin, float))
+    graph = _to_map(cell_graph, space, resolution, origin)
     return GridTopology(graph, count, float(areas[:count].sum()), float(areas[count:].sum()))
 
 
-# From cells to the map frame.
+def _check_sizes(
+    resolution: float, robot_radius: float, min_obstacle_size: float, min_region_area: float | None
+) -> None:
+    """Raise ValueError if a size is out of range."""
+    if not 0.0 < resolution < np.inf:
+        raise ValueError(f"resolution is {resolution}, not a positive number of metres")
+    for name, size, unit in (
+        ("robot_radius", robot_radius, "metres"),
+        ("min_obstacle_size", min_obstacle_size, "metres"),
+        ("min_region_area", 0.0 if min_region_area is None else min_region_area, "square metres"),
+    ):
+        if not 0.0 <= size < np.inf:
+            raise ValueError(f"{name} is {size}, not a number of {unit} >= 0")
 
 
 def _to_map(
@@ -119,6 +138,7 @@ def _to_map(
 
     arcs = list(cell_graph.arcs.values())
     lines = tuple(to_map(arc.line) for arc in arcs)
+    clearances = [_smallest_clearance(arc.line, space.nearest_obstacle) for arc in arcs]
     return TopologicalMap(
         id=np.arange(len(names)),
         xy=to_map(cells),
@@ -126,10 +146,7 @@ def _to_map(
         clearance=space.distance[tuple(cells.T)] * resolution,
         arc_ends=np.array([[index[node] for node in arc.ends] for arc in arcs], int).reshape(-1, 2),
         arc_length=np.array([polylines.length(line) for line in lines], float),
-        arc_clearance=np.array(
-            [_smallest_clearance(arc.line, space.nearest_obstacle) for arc in arcs]
-        )
-        * resolution,
+        arc_clearance=resolution * np.array(clearances),
         arc_lines=lines,
     )
 

@@ -109,12 +109,8 @@ def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) 
     is_wall = wall[tuple(np.clip(space.nearest_obstacle, 0, last_index))]
     distance = space.distance + 0.5
     for low, high in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
-        apart = np.hypot(
-            *(
-                space.nearest_obstacle[(slice(None), *low)]
-                - space.nearest_obstacle[(slice(None), *high)]
-            )
-        )
+        row, column = space.nearest_obstacle
+        apart = np.hypot(row[low] - row[high], column[low] - column[high])
         between = apart >= 2 * np.sin(0.5 * angle) * np.maximum(distance[low], distance[high])
         between &= inside[low] & inside[high] & (is_wall[low] | is_wall[high])
         high_is_farther = distance[high] > distance[low]
@@ -162,10 +158,10 @@ def _rules() -> tuple[np.ndarray, np.ndarray]:
     """
     pattern = np.arange(256)
     background = [1 - ((pattern >> (k % 8)) & 1) for k in range(9)]
-    number = sum(
+    terms = [
         background[k] - background[k] * background[k + 1] * background[k + 2] for k in (0, 2, 4, 6)
-    )
-    return number == 1, 8 - sum(background[:8])
+    ]
+    return np.sum(terms, axis=0) == 1, 8 - np.sum(background[:8], axis=0)
 
 
 _SIMPLE, _COUNT = _rules()

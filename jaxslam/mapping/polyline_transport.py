@@ -15,7 +15,7 @@ def attach_polyline(line: Array, first: Array, last: Array) -> Array:
 
         q_k = first + R (p_k - p_1) + s_k (new - R old)        s_k = (k - 1) / (K - 1)
 
-    so that q_1 = first and q_K = last. The shape is kept; a change of the chord's length is spread
+    so that q_1 = first and q_K = last. The form is kept; a change of the chord's length is spread
     evenly over the points. R is the identity if a chord is shorter than `MIN_CHORD`, as in a loop.
 
            stored              rotated with its chord        gap closed

@@ -1,14 +1,19 @@
-"""The pose graph of a filtered log: measurements with information matrices, estimates as guess."""
+"""The pose graph of a filtered log: measurements with information matrices, estimates as guess.
+
+It is what `jaxslam.io.g2o_writer` writes, for other optimisers such as g2o and GTSAM.
+"""
 
 from functools import partial
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxslam.core import trace_cache
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.types import WALL, Array
+from jaxslam.core.types import WALL, Array, as_float64, check_array
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.config import FilterConfig, confirmed
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
@@ -20,8 +25,8 @@ class PoseGraph(NamedTuple):
     """Poses (T,), landmarks (L,), and the factors between them.
 
     Attributes:
-        poses: (T, 3) [m, m, rad].
-        landmark_positions: (L, 2) [m] landmark positions.
+        poses: (T, 3) [m, m, rad] estimates, map frame.
+        landmark_positions: (L, 2) [m] estimates, map frame.
         odometry: (T - 1, 3) [m, m, rad] odometry from each pose to the next, in its frame.
         odometry_information: (T - 1, 3, 3) inverse covariance.
         pose_index: (K,) index of the pose that a landmark was observed from.
@@ -46,30 +51,29 @@ class PoseGraph(NamedTuple):
     closure_information: np.ndarray = np.zeros((0, 3, 3))
 
 
-ODOMETRY_STD_FLOOR = 1e-4  # [m], [rad] std added to each motion: a robot that stands still has none
+# [m], [rad] standard deviation added to each odometry increment: that of a robot at rest has none.
+ODOMETRY_STD_FLOOR = 1e-4
 
 
 @partial(trace_cache.jit, static_argnames="config")
 def _noise_model(
-    config: FilterConfig, noise: NoiseParams, inputs: Measurement
+    config: FilterConfig, params: NoiseParams, measurements: Measurement
 ) -> tuple[Array, Array, Array]:
     """Motions (T, 3), their covariances (T, 3, 3), and those of features (T, M, 2, 2)."""
+    inflation = config.untrusted_inflation
 
-    def of_scan(now: Measurement) -> tuple[Array, Array, Array]:
-        motion, q = motion_estimate(noise, now)
-        return (
-            motion,
-            q,
-            measurement_cov(noise, now.features, untrusted_inflation=config.untrusted_inflation),
-        )
+    def of_scan(measurement: Measurement) -> tuple[Array, Array, Array]:
+        motion, q = motion_estimate(params, measurement)
+        r = measurement_cov(params, measurement.features, untrusted_inflation=inflation)
+        return motion, q, r
 
-    return jax.vmap(of_scan)(inputs)
+    return jax.vmap(of_scan)(measurements)
 
 
 def build_pose_graph(
     config: FilterConfig,
     params: NoiseParams,
-    poses: np.ndarray,
+    poses: ArrayLike,
     belief: Belief,
     info: StepInfo,
     measurements: Measurement,
@@ -86,17 +90,21 @@ def build_pose_graph(
     Args:
         config: Of the filter.
         params: Noise parameters of the filter.
-        poses: (T, 3) estimated poses of the scans.
+        poses: (T, 3) [m, m, rad] estimated poses of the scans, map frame.
         belief: Of the filter at the end.
         info: [T] of the filter.
         measurements: [T] that it was given.
         loop_closures: Loop closures, if there are any.
+
+    Raises:
+        ValueError: An argument is of another type, or their numbers of scans differ.
     """
+    poses = _checked(config, poses, belief, info, measurements)
     kept = np.asarray(confirmed(config, belief) & (belief.kind != WALL))
     landmark_ids, feature_ids = np.asarray(belief.id)[kept], np.asarray(info.id)
     scan, feature = np.nonzero(np.isin(feature_ids, landmark_ids) & (feature_ids >= 0))
     index = {landmark: k for k, landmark in enumerate(landmark_ids.tolist())}
-    motion, q, r = _noise_model(config, params, measurements)
+    odometry, q, r = _noise_model(config, params, measurements)
     q = np.asarray(q, np.float64) + ODOMETRY_STD_FLOOR**2 * np.eye(3)
     r = np.asarray(r, np.float64)[scan, feature]
     xy = np.asarray(measurements.features.xy, np.float64)[scan, feature]
@@ -106,7 +114,7 @@ def build_pose_graph(
     graph = PoseGraph(
         poses=poses,
         landmark_positions=np.asarray(belief.landmark_positions, np.float64)[kept],
-        odometry=np.asarray(motion, np.float64)[1:],
+        odometry=np.asarray(odometry, np.float64)[1:],
         odometry_information=np.linalg.inv(q[1:]),
         pose_index=scan,
         landmark_index=np.array(
@@ -122,3 +130,28 @@ def build_pose_graph(
         closure_pose=loop_closures.relative_pose,
         closure_information=loop_closures.information,
     )
+
+
+def _checked(
+    config: FilterConfig,
+    poses: ArrayLike,
+    belief: Belief,
+    info: StepInfo,
+    measurements: Measurement,
+) -> np.ndarray:
+    """Poses (T, 3) in float64; ValueError if types or shapes do not fit."""
+    for name, record, kind in (
+        ("config", config, FilterConfig),
+        ("belief", belief, Belief),
+        ("info", info, StepInfo),
+        ("measurements", measurements, Measurement),
+    ):
+        if not isinstance(record, kind):
+            raise ValueError(f"{name} is of type {type(record).__name__}, not {kind.__name__}")
+    poses = as_float64("poses", poses, ("T", 3))
+    count = len(poses)
+    check_array("measurements.odometry", measurements.odometry, (count, 3), jnp.floating)
+    num_features = np.shape(measurements.features.valid)[-1]
+    check_array("info.id", info.id, (count, num_features), jnp.integer)
+    check_array("measurements.features.xy", measurements.features.xy, (count, num_features, 2))
+    return poses

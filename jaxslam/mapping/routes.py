@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.types import as_float64, check_array
 
 
 class Route(NamedTuple):
@@ -38,22 +41,27 @@ def find_route(
         min_clearance: [m] that each arc must have; above 0, arcs without a known one are not used.
 
     Raises:
-        ValueError: No arcs of that clearance lead from `start` to `goal`, or there is no such node.
+        ValueError: No arcs of that clearance lead from `start` to `goal`, there is no such node,
+            or an argument is of another type.
     """
-    usable = (min_clearance <= 0.0) | (
-        topological_map.arc_clearance >= min_clearance
-    )  # NaN compares false
+    if not isinstance(topological_map, TopologicalMap):
+        given = type(topological_map).__name__
+        raise ValueError(f"topological_map is of type {given}, not TopologicalMap")
+    if not np.isfinite(min_clearance):
+        raise ValueError(f"min_clearance is {min_clearance}, not a finite number of metres")
+    # A clearance that is not known, NaN, compares false.
+    usable = (min_clearance <= 0.0) | (topological_map.arc_clearance >= min_clearance)
     lengths = np.where(usable, topological_map.arc_length, np.inf)
     arcs = shortest_path(
         topological_map.arc_ends, lengths, start, goal, num_nodes=len(topological_map.xy)
     )
-    nodes, line = join_arcs(topological_map.arc_lines, topological_map.arc_ends, arcs, start)
-    line = line if arcs else topological_map.xy[[start]]
+    nodes, line = join_arcs(topological_map.arc_lines, topological_map.arc_ends, arcs, int(start))
+    line = line if arcs else topological_map.xy[[int(start)]]
     return Route(nodes, arcs, line, float(np.sum(topological_map.arc_length[arcs])))
 
 
 def shortest_path(
-    pairs: np.ndarray, lengths: np.ndarray, start: int, goal: int, *, num_nodes: int
+    pairs: ArrayLike, lengths: ArrayLike, start: int, goal: int, *, num_nodes: int
 ) -> list[int]:
     """Arcs of the shortest path from node `start` to node `goal`, in order (Dijkstra).
 
@@ -63,7 +71,7 @@ def shortest_path(
         lengths: (A,) [m], not negative; infinite for arcs that must not be used.
         start: Index of the first node.
         goal: Index of the last node.
-        num_nodes: Number of nodes.
+        num_nodes: N, number of nodes.
 
     Returns:
         Indices of the arcs; empty if `start` is `goal`.
@@ -72,12 +80,24 @@ def shortest_path(
         ValueError: No arcs lead from `start` to `goal`, there is no such node, or a length is
             negative, NaN or missing.
     """
-    for node in (start, goal):
+    for name, node in (("start", start), ("goal", goal)):
+        check_array(name, np.asarray(node), (), jnp.integer)
         if not 0 <= node < num_nodes:
-            raise ValueError(f"no node {node}: the map has the nodes 0 to {num_nodes - 1}")
-    pairs, lengths = np.asarray(pairs, int).reshape(-1, 2), np.asarray(lengths, float)
-    if lengths.shape != (len(pairs),) or np.any(lengths < 0) or np.any(np.isnan(lengths)):
-        raise ValueError(f"lengths {lengths.shape} must be numbers >= 0, one of {len(pairs)} arcs")
+            raise ValueError(f"{name} is {node}, not a node 0 to {num_nodes - 1}")
+    lengths = as_float64("lengths", lengths, ("A",))
+    pairs = _checked_pairs(pairs, len(lengths), num_nodes)
+    if np.any(lengths < 0) or np.any(np.isnan(lengths)):
+        raise ValueError("lengths holds numbers that are negative or NaN")
+    path = find_path(pairs, lengths, int(start), int(goal), num_nodes=num_nodes)
+    if path is None:
+        raise ValueError(f"no route leads from node {start} to node {goal}")
+    return path
+
+
+def find_path(
+    pairs: np.ndarray, lengths: np.ndarray, start: int, goal: int, *, num_nodes: int
+) -> list[int] | None:
+    """As `shortest_path`, without checks; None if no arcs lead from `start` to `goal`."""
     # The shortest of parallel arcs; the sparse matrix would add them up.
     ends = np.sort(pairs, axis=1)
     order = np.argsort(lengths, kind="stable")[: np.count_nonzero(lengths < np.inf)]
@@ -86,21 +106,33 @@ def shortest_path(
     predecessor = csgraph.dijkstra(
         adjacency, directed=False, indices=start, return_predecessors=True
     )[1]
-    path, node = [], int(goal)
+    path: list[int] = []
+    node = goal
     while node != start:
         previous = int(predecessor[node])
         if previous < 0:
-            raise ValueError(f"no route leads from place {start} to place {goal}")
+            return None
         parallel = np.flatnonzero(np.all(ends == sorted((previous, node)), axis=1))
         path.append(int(parallel[np.argmin(lengths[parallel])]))
         node = previous
     return path[::-1]
 
 
+def _checked_pairs(pairs: ArrayLike, count: int, num_nodes: int) -> np.ndarray:
+    """Pairs (A, 2) int of nodes as an array; ValueError if they are no such pairs."""
+    pairs = np.asarray(pairs)
+    if pairs.size == 0:
+        pairs = np.zeros((0, 2), int)
+    check_array("pairs", pairs, (count, 2), jnp.integer)
+    if pairs.size and not (0 <= pairs.min() and pairs.max() < num_nodes):
+        raise ValueError(f"pairs holds nodes {pairs.min()} to {pairs.max()} of {num_nodes}")
+    return pairs
+
+
 def join_arcs(
     lines: Sequence[np.ndarray], pairs: np.ndarray, arcs: Sequence[int], start: int
 ) -> tuple[list[int], np.ndarray]:
-    """Nodes and polyline of a path.
+    """The nodes and the polyline of a path.
 
     Args:
         lines: A polylines (n >= 2, 2) [m] of all arcs.
@@ -109,9 +141,10 @@ def join_arcs(
         start: Index of the first node.
 
     Returns:
-        Indices of the nodes in order, and the polyline (n, 2) [m]; (0, 2) without arcs.
+        Indices of the nodes, in order, and the polyline (n, 2) [m]; (0, 2) without arcs.
     """
-    node, nodes, pieces = start, [start], []
+    node, nodes = start, [start]
+    pieces: list[np.ndarray] = []
     for k in arcs:
         a, b = (int(end) for end in pairs[k])
         pieces.append(lines[k] if a == node else lines[k][::-1])

@@ -1,4 +1,22 @@
-"""TODO."""
+"""Point-to-line ICP of one scan against a submap of earlier scans.
+
+With R = R(heading) and t the position of a pose, a scan point p has the position q = R p + t in the
+frame of the submap. Its correspondence on scan k of the submap, if it has one, is the oriented
+point s with unit normal n nearest to q among the beams around its bearing. Then
+
+    e     = n^T (q - s)                                    residual: distance to the line
+    de    = [n_x, n_y, n_y (R p)_x - n_x (R p)_y] dpose    its derivative, a row J
+    w     = share / (1 + (e / kernel)^2)^2                 Geman-McClure weight
+    H     = sum w J^T J / point_std^2                      information of the scan
+    dpose = (H + H_prior)^-1 (-sum w J^T e / point_std^2 + H_prior (pose_prior - pose))
+
+where the sums run over all points and scans of the submap, and `share` is one over the number of
+correspondences of the point, so that each point counts once. H_prior is the prior's information.
+
+References:
+    Censi (2008), An ICP variant using a point-to-line metric. Geman, McClure (1987), Statistical
+    methods for tomographic image reconstruction: the kernel.
+"""
 
 from functools import partial
 from typing import NamedTuple
@@ -13,26 +31,31 @@ from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.matching.oriented_points import OrientedPoints
 
-FAR_AWAY = 1e6  # [m] coordinates of points that must not become correspondences
+FAR_AWAY = 1e6
+"""[m] coordinates of points that must not become correspondences."""
 
 
 class ScanMatchSpec(NamedTuple):
     """Options of scan matching; static under jit.
 
     Attributes:
-        window_scans: K, keyframes of the local map.
-        keyframe_distance: [m], [rad] motion since the last keyframe from which a scan becomes the next one.
+        window_scans: K, keyframes of the submap.
+        keyframe_distance: [m], [rad] motion since the last keyframe from which a scan becomes the
+            next one.
         max_beams: Points of a scan that are matched at most, evenly spaced.
-        beam_window: Beams on either side of a point's own beam that are searched for its correspondence.
+        beam_window: Beams on either side of a point's own beam that are searched for its
+            correspondence.
         heading_guesses: [rad] offsets of the initial headings from that of the odometry.
         coarse_scans: Keyframes that the coarse search matches against.
         coarse_stride: Every how many points the coarse search uses one.
-        coarse_gates: [m] largest distance of a correspondence, iteration by iteration, in the coarse search.
+        coarse_gates: [m] largest distance of a correspondence, iteration by iteration, in the
+            coarse search.
         fine_gates: [m] the same in the refinement.
-        kernel_scales: [m] residual at which the weight is one quarter, in coarse search and refinement.
+        kernel_scales: [m] residual at which the weight is one quarter, in coarse search and
+            refinement.
         inner_iterations: Gauss-Newton steps between two searches for correspondences.
-        point_std: [m] std of a point's distance to its line. Much larger than that of a range, as the
-            errors of neighbouring points are correlated.
+        point_std: [m] std of a point's distance to its line. Much larger than that of a range, as
+            the errors of neighbouring points are correlated.
         odometry_std_floor: [m], [rad] least std of the odometry prior.
         odometry_slip: Std of the odometry prior as fractions of distance and of turn.
     """
@@ -58,15 +81,27 @@ class Submap(NamedTuple):
 
     Attributes:
         oriented_points: [K] oriented points, in the odometry frame.
-        poses: (K, 3) of the keyframes.
+        poses: (K, 3) [m, m, rad] of the keyframes.
         num_added: () int32 keyframes ever added; number n is in slot n modulo K.
-        last_pose: (3,) of the last scan, keyframe or not.
+        last_pose: (3,) [m, m, rad] of the last scan, keyframe or not.
     """
 
     oriented_points: OrientedPoints
     poses: Array
     num_added: Array
     last_pose: Array
+
+
+class PosePrior(NamedTuple):
+    """What is known of a scan's pose before it is matched, in the frame of the submap.
+
+    Attributes:
+        pose: (3,) [m, m, rad] mean.
+        information: (3, 3) inverse covariance.
+    """
+
+    pose: Array
+    information: Array
 
 
 class _Correspondences(NamedTuple):
@@ -83,19 +118,78 @@ class _Correspondences(NamedTuple):
     share: Array
 
 
+def icp(
+    spec: ScanMatchSpec,
+    lidar: Lidar,
+    submap: Submap,
+    prior: PosePrior,
+    start: Array,
+    points: Array,
+    hit: Array,
+    *,
+    gates: tuple[float, ...],
+    kernel_scale: float,
+) -> tuple[Array, Array, Array]:
+    """Point-to-line ICP of one scan against a submap; the module's docstring has the formulas.
+
+        for each gate:
+            find the correspondences at the pose, none further than the gate
+            repeat `spec.inner_iterations` times:  pose += (H + H_prior)^-1 (...)
+
+    Args:
+        spec: Options.
+        lidar: The scanner that the submap was made with.
+        submap: What to match against.
+        prior: Pose that is expected, as by odometry.
+        start: (3,) [m, m, rad] initial pose, in the frame of the submap.
+        points: (N, 2) [m] of the scan, robot frame.
+        hit: (N,) bool, those of them that exist.
+        gates: [m] largest distance of a correspondence, iteration by iteration; static.
+        kernel_scale: [m] scale of the Geman-McClure kernel.
+
+    Returns:
+        Pose (3,), its heading not wrapped; information (3, 3) of the scan alone, in the frame of
+        the submap; inlier fraction (), in which a residual e counts exp(-(e / kernel)^2 / 8).
+    """
+
+    def correspondences(pose: Array, gate: Array) -> _Correspondences:
+        return _correspondences(spec, lidar, submap, transform(pose, points), hit, gate)
+
+    def gauss_newton(pairs: _Correspondences, pose: Array, _: None) -> tuple[Array, None]:
+        information, descent = _normal_equations(spec, kernel_scale, pairs, pose, points)
+        offset = prior.pose - pose
+        descent = descent + prior.information @ offset.at[2].set(wrap_angle(offset[2]))
+        root = inverse_cholesky(information + prior.information)[0]
+        return pose + root.T @ (root @ descent), None
+
+    def iterate(pose: Array, gate: Array) -> tuple[Array, None]:
+        step = partial(gauss_newton, correspondences(pose, gate))
+        return lax.scan(step, pose, length=spec.inner_iterations)
+
+    pose, _ = lax.scan(iterate, start, jnp.array(gates))
+    pairs = correspondences(pose, jnp.asarray(gates[-1]))
+    information, _ = _normal_equations(spec, kernel_scale, pairs, pose, points)
+    registered = transform(pose, points)
+    error = jnp.sum(pairs.normal * registered[None], axis=-1) - pairs.offset
+    inlier = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel_scale) ** 2) / 8), 0.0)
+    count = jnp.maximum(jnp.sum(hit, dtype=pose.dtype), 1.0)
+    return pose, information, jnp.sum(jnp.max(inlier, axis=0)) / count
+
+
 def _correspondences(
-    spec: ScanMatchSpec, lidar: Lidar, local: Submap, points: Array, hit: Array, far: Array
+    spec: ScanMatchSpec, lidar: Lidar, submap: Submap, points: Array, hit: Array, gate: Array
 ) -> _Correspondences:
-    """Correspondences of points (N, 2), frame of the map: the nearest in each scan, if near enough.
+    """Correspondences of points (N, 2), frame of the submap: in each scan the nearest in the gate.
 
     The search is projective: a point is transformed to the robot frame of the keyframe, its bearing
-    gives a beam, and only the beams within `spec.reach` of that are compared. `far` () [m] limits
-    the distances across and along the line; along it, the gap between two beams is allowed too.
+    gives a beam, and only the beams within `spec.beam_window` of that are compared. `gate` () [m]
+    limits the distances across and along the line; along it, the gap between two beams is allowed
+    too.
     """
     middle = lidar.angle_min + lidar.angle_increment * (lidar.num_beams - 1) / 2
     # Column by column, as pairs of numbers are gathered slowly.
     columns = jnp.where(
-        local.oriented_points.valid[..., None], local.oriented_points.points, FAR_AWAY
+        submap.oriented_points.valid[..., None], submap.oriented_points.points, FAR_AWAY
     )
     columns = columns.swapaxes(1, 2)
 
@@ -116,24 +210,24 @@ def _correspondences(
         normal = surface.normal[nearest]
         offset = dot(normal, surface.points[nearest])
         across = dot(normal, points) - offset
-        limit = jnp.maximum(far, surface.neighbour_gap[nearest])
-        near = (jnp.abs(across) < far) & (least - across**2 < limit**2)
+        limit = jnp.maximum(gate, surface.neighbour_gap[nearest])
+        near = (jnp.abs(across) < gate) & (least - across**2 < limit**2)
         return normal, offset, surface.valid[nearest] & hit & near
 
-    normal, offset, found = jax.vmap(on_keyframe)(local.oriented_points, columns, local.poses)
+    normal, offset, found = jax.vmap(on_keyframe)(submap.oriented_points, columns, submap.poses)
     found = found.astype(points.dtype)
     share = found / jnp.maximum(found.sum(axis=0), 1.0)[None]
     return _Correspondences(normal, offset, share)
 
 
 def _normal_equations(
-    spec: ScanMatchSpec, pairs: _Correspondences, points: Array, pose: Array, kernel: Array
+    spec: ScanMatchSpec, kernel_scale: float, pairs: _Correspondences, pose: Array, points: Array
 ) -> tuple[Array, Array]:
-    """H (3, 3) and -sum w J^T e / noise^2 (3,), for points (N, 2), robot frame, at a pose (3,)."""
+    """H (3, 3) and -sum w J^T e / point_std^2 (3,) at a pose (3,), points (N, 2) in robot frame."""
     x, y = (points @ rotation(pose[2]).T).T
     normal_x, normal_y = pairs.normal[..., 0], pairs.normal[..., 1]
     error = normal_x * (x + pose[0])[None] + normal_y * (y + pose[1])[None] - pairs.offset
-    weight = pairs.share / (1.0 + (error / kernel) ** 2) ** 2
+    weight = pairs.share / (1.0 + (error / kernel_scale) ** 2) ** 2
     by_heading = normal_y * x[None] - normal_x * y[None]
     jacobian = normal_x, normal_y, by_heading
 
@@ -146,61 +240,3 @@ def _normal_equations(
     )
     descent = jnp.stack([total(column, -error) for column in jacobian])
     return square / spec.point_std**2, descent / spec.point_std**2
-
-
-def icp(
-    spec: ScanMatchSpec,
-    lidar: Lidar,
-    local: Submap,
-    points: Array,
-    hit: Array,
-    start: Array,
-    wheels: tuple[Array, Array],
-    far: tuple[float, ...],
-    kernel: float,
-) -> tuple[Array, Array, Array]:
-    """Point-to-line ICP of one scan against the local map; the module's docstring has the formulas.
-
-        for each distance of `far`:
-            find the correspondences at the pose
-            repeat `spec.inner` times:  pose += (H + H_odom)^-1 (...)
-
-    Args:
-        spec: Options.
-        lidar: The scanner that the map was made with.
-        local: What to match against.
-        points: (N, 2) [m] of the scan, robot frame.
-        hit: (N,) bool, those of them that exist.
-        start: (3,) initial pose, in the frame of the map.
-        wheels: Pose (3,) by the odometry, and its information (3, 3).
-        far: [m] largest distance of a correspondence, iteration by iteration.
-        kernel: [m] scale of the Geman-McClure kernel.
-
-    Returns:
-        Pose (3,), its heading not wrapped; information (3, 3) of the scan alone, in the frame of
-        the map; inlier fraction (), in which a residual e counts exp(-(e / kernel)^2 / 8).
-    """
-    odometry_pose, odometry_information = wheels
-
-    def correspondences(pose: Array, far: Array) -> _Correspondences:
-        return _correspondences(spec, lidar, local, transform(pose, points), hit, far)
-
-    def gauss_newton(pairs: _Correspondences, pose: Array, _: None) -> tuple[Array, None]:
-        information, descent = _normal_equations(spec, pairs, points, pose, kernel)
-        offset = odometry_pose - pose
-        descent = descent + odometry_information @ offset.at[2].set(wrap_angle(offset[2]))
-        root = inverse_cholesky(information + odometry_information)[0]
-        return pose + root.T @ (root @ descent), None
-
-    def iterate(pose: Array, far: Array) -> tuple[Array, None]:
-        step = partial(gauss_newton, correspondences(pose, far))
-        return lax.scan(step, pose, length=spec.inner_iterations)
-
-    pose, _ = lax.scan(iterate, start, jnp.array(far))
-    pairs = correspondences(pose, jnp.asarray(far[-1]))
-    information, _ = _normal_equations(spec, pairs, points, pose, kernel)
-    registered = transform(pose, points)
-    error = jnp.sum(pairs.normal * registered[None], axis=-1) - pairs.offset
-    inlier = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel) ** 2) / 8), 0.0)
-    count = jnp.maximum(jnp.sum(hit, dtype=pose.dtype), 1.0)
-    return pose, information, jnp.sum(jnp.max(inlier, axis=0)) / count

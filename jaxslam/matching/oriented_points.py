@@ -1,4 +1,10 @@
-"""TODO."""
+"""Oriented points: the points of a scan, each with the normal of the surface that it lies on.
+
+Point-to-line ICP (`icp`) measures the distance of a point from a line. The lines are those fitted
+here, to a point and its neighbours on the same surface. A surface ends where the gap between two
+neighbouring points is too large for their range; points of corners and of scattered returns, whose
+neighbours are on no line, are not valid.
+"""
 
 from typing import NamedTuple
 
@@ -9,13 +15,18 @@ from jaxslam.core.se2 import dot, rotation, transform
 from jaxslam.core.types import Array
 from jaxslam.frontend.lidar import beam_ends
 
-NORMAL_NEIGHBOURS = 3  # beams on either side that a normal is fitted to
-MAX_NEIGHBOUR_GAP = (0.06, 0.1)  # [m], and fraction of the range: larger gaps separate two surfaces
-MAX_FLATNESS = 0.04  # largest variance across a surface, as a fraction of that along it
+NORMAL_NEIGHBOURS = 3
+"""Beams on either side that a normal is fitted to."""
+
+MAX_NEIGHBOUR_GAP = (0.06, 0.1)
+"""[m], and fraction of the range: larger gaps separate two surfaces."""
+
+MAX_FLATNESS = 0.04
+"""Largest variance across a surface, as a fraction of that along it."""
 
 
 class OrientedPoints(NamedTuple):
-    """Oriented points: points of a scan with the normals of their surfaces, in some frame.
+    """Points of a scan with the normals of their surfaces, in some frame.
 
     Attributes:
         points: (R, 2) [m] on the line fitted to the point and its neighbours.
@@ -35,26 +46,15 @@ def oriented_points(lidar: Lidar, scan: Scan) -> OrientedPoints:
 
     The line of a point is the least-squares fit to itself and its neighbours up to the first gap.
 
+    Args:
+        lidar: The scanner.
+        scan: One scan.
+
     Raises:
         ValueError: The ranges are not those of one scan of this lidar; while tracing.
     """
-    own = beam_ends(lidar, scan)
-    index = jnp.arange(lidar.num_beams)
-    neighbours, weight, gap = [own], [scan.hit], jnp.zeros(lidar.num_beams)
-    limit = MAX_NEIGHBOUR_GAP[0] + MAX_NEIGHBOUR_GAP[1] * scan.ranges
-    for side in (1, -1):
-        joined, previous = scan.hit, own
-        for k in range(1, NORMAL_NEIGHBOURS + 1):
-            beam = index + side * k
-            inside = (beam >= 0) & (beam < lidar.num_beams)
-            beam = jnp.clip(beam, 0, lidar.num_beams - 1)
-            distance = jnp.linalg.norm(own[beam] - previous, axis=-1)
-            joined = joined & inside & scan.hit[beam] & (distance < limit)
-            previous = own[beam]
-            neighbours.append(previous)
-            weight.append(joined)
-            gap = jnp.where(joined & (k == 1), jnp.maximum(gap, distance), gap)
-    neighbours, weight = jnp.stack(neighbours), jnp.stack(weight).astype(own.dtype)
+    ends = beam_ends(lidar, scan)
+    neighbours, weight, gap = _neighbours(lidar, scan, ends)
     count = jnp.maximum(weight.sum(axis=0), 1.0)
     centre = jnp.sum(weight[..., None] * neighbours, axis=0) / count[:, None]
     offset = neighbours - centre[None]
@@ -67,13 +67,36 @@ def oriented_points(lidar: Lidar, scan: Scan) -> OrientedPoints:
     normal = jnp.stack([-jnp.sin(direction), jnp.cos(direction)], axis=-1)
     spread, mean = jnp.hypot(xx - yy, 2 * xy) / 2, (xx + yy) / 2
     flat = mean - spread < MAX_FLATNESS * (mean + spread)
-    projected = own - dot(own - centre, normal)[:, None] * normal
+    projected = ends - dot(ends - centre, normal)[:, None] * normal
     return OrientedPoints(projected, normal, gap, scan.hit & (count >= 3.0) & flat)
 
 
-def transform_points(surfaces: OrientedPoints, pose: Array) -> OrientedPoints:
+def _neighbours(lidar: Lidar, scan: Scan, ends: Array) -> tuple[Array, Array, Array]:
+    """Points on the surface of each point, with N = 2 `NORMAL_NEIGHBOURS` + 1.
+
+    Returns:
+        Ends (N, R, 2) [m] of the beam and its neighbours, their weights (N, R), 1 on the surface
+        and 0 off it; and `OrientedPoints.neighbour_gap` (R,).
+    """
+    index = jnp.arange(lidar.num_beams)
+    neighbours, on_surface, gap = [ends], [scan.hit], jnp.zeros(lidar.num_beams)
+    limit = MAX_NEIGHBOUR_GAP[0] + MAX_NEIGHBOUR_GAP[1] * scan.ranges
+    for side in (1, -1):
+        joined, previous = scan.hit, ends
+        for k in range(1, NORMAL_NEIGHBOURS + 1):
+            beam = index + side * k
+            inside = (beam >= 0) & (beam < lidar.num_beams)
+            beam = jnp.clip(beam, 0, lidar.num_beams - 1)
+            distance = jnp.linalg.norm(ends[beam] - previous, axis=-1)
+            joined = joined & inside & scan.hit[beam] & (distance < limit)
+            previous = ends[beam]
+            neighbours.append(previous)
+            on_surface.append(joined)
+            gap = jnp.where(joined & (k == 1), jnp.maximum(gap, distance), gap)
+    return jnp.stack(neighbours), jnp.stack(on_surface).astype(ends.dtype), gap
+
+
+def transform_points(pose: Array, points: OrientedPoints) -> OrientedPoints:
     """Oriented points of the frame of a pose (3,), in the frame that the pose is given in."""
     turn = rotation(pose[2])
-    return surfaces._replace(
-        points=transform(pose, surfaces.points), normal=surfaces.normal @ turn.T
-    )
+    return points._replace(points=transform(pose, points.points), normal=points.normal @ turn.T)

@@ -1,1 +1,20 @@
-"""TODO."""
+"""From a log of scans and odometry to trajectory and map: whole, scan by scan, or as episodes."""
+
+from jaxslam.pipeline.config import Config as Config
+from jaxslam.pipeline.episodes import TrialResult as TrialResult
+from jaxslam.pipeline.episodes import concatenate_results as concatenate_results
+from jaxslam.pipeline.episodes import episode_from_arrays as episode_from_arrays
+from jaxslam.pipeline.episodes import episode_from_landmark_log as episode_from_landmark_log
+from jaxslam.pipeline.episodes import episode_from_laser_log as episode_from_laser_log
+from jaxslam.pipeline.episodes import filter_episodes as filter_episodes
+from jaxslam.pipeline.episodes import landmark_log_config as landmark_log_config
+from jaxslam.pipeline.episodes import laser_log_config as laser_log_config
+from jaxslam.pipeline.offline import SlamResult as SlamResult
+from jaxslam.pipeline.offline import run_slam as run_slam
+from jaxslam.pipeline.online import ChunkResult as ChunkResult
+from jaxslam.pipeline.online import SlamState as SlamState
+from jaxslam.pipeline.online import init as init
+from jaxslam.pipeline.online import match_log as match_log
+from jaxslam.pipeline.online import topological_map as topological_map
+from jaxslam.pipeline.online import update as update
+from jaxslam.pipeline.stacking import stack_episodes as stack_episodes

@@ -2,15 +2,21 @@
 
 from typing import NamedTuple
 
-from jaxslam.core.scan import Lidar
+from jaxslam.core.scan import Lidar, check_lidar
+from jaxslam.core.types import JUNCTION
+from jaxslam.filtering import config as filter_config
 from jaxslam.filtering.config import FilterConfig
+from jaxslam.frontend import config as frontend_config
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import field_of_view
+from jaxslam.matching.checks import check_scan_match_spec
 from jaxslam.matching.icp import ScanMatchSpec
-from jaxslam.matching.loop_closure import LoopClosureSpec
+from jaxslam.matching.registration import LoopClosureSpec, check_loop_closure_spec
 
 MAX_LANDMARKS = 2048  # default capacity for landmarks: a building with some kilometres of corridors
 LOG_CONFIRM_COUNT = 3  # real buildings have clutter that looks like a landmark once or twice
+FRONTEND, FILTER = FrontendConfig(), FilterConfig()  # the defaults
+SCAN_MATCHING, LOOP_CLOSURE = ScanMatchSpec(), LoopClosureSpec()
 
 
 class Config(NamedTuple):
@@ -25,20 +31,20 @@ class Config(NamedTuple):
         loop_closure: Loop closures, for batch smoothing.
     """
 
-    frontend: FrontendConfig = FrontendConfig()
-    filter: FilterConfig = FilterConfig()
-    scan_matching: ScanMatchSpec = ScanMatchSpec()
-    loop_closure: LoopClosureSpec = LoopClosureSpec()
+    frontend: FrontendConfig = FRONTEND
+    filter: FilterConfig = FILTER
+    scan_matching: ScanMatchSpec = SCAN_MATCHING
+    loop_closure: LoopClosureSpec = LOOP_CLOSURE
 
     @classmethod
     def for_lidar(
         cls,
         lidar: Lidar,
         *,
-        frontend: FrontendConfig = FrontendConfig(),
-        filter: FilterConfig = FilterConfig(),  # noqa: A002
-        scan_matching: ScanMatchSpec = ScanMatchSpec(),
-        loop_closure: LoopClosureSpec = LoopClosureSpec(),
+        frontend: FrontendConfig = FRONTEND,
+        filter: FilterConfig = FILTER,  # noqa: A002, as the field is called
+        scan_matching: ScanMatchSpec = SCAN_MATCHING,
+        loop_closure: LoopClosureSpec = LOOP_CLOSURE,
     ) -> "Config":
         """Configuration for a scanner: front end and filter know it alike.
 
@@ -48,7 +54,11 @@ class Config(NamedTuple):
             filter: The rest of the filter.
             scan_matching: Of the configuration.
             loop_closure: Of the configuration.
+
+        Raises:
+            ValueError: The scanner is impossible.
         """
+        check_lidar(lidar)
         return cls(
             frontend._replace(lidar=lidar),
             filter._replace(field_of_view=field_of_view(lidar)),
@@ -62,17 +72,43 @@ class Config(NamedTuple):
 
         Args:
             lidar: The scanner of the log.
-            max_landmarks: L, capacity of the map; slots are taken as they are needed.
+            max_landmarks: L, capacity of the map; `run_slam` takes slots as they are needed.
         """
         own = FilterConfig(max_landmarks=max_landmarks, confirm_count=LOG_CONFIRM_COUNT)
         return cls.for_lidar(lidar, filter=own)
 
+    @classmethod
+    def for_landmark_sensor(cls, num_landmarks: int, max_measurements: int) -> "Config":
+        """A sensor that measures range and bearing of landmarks that it identifies.
+
+        Updates use the invariant linearisation: with few, distant landmarks corrections of the
+        heading are large.
+
+        Args:
+            num_landmarks: L, number of landmarks; their ids are 0 to L - 1.
+            max_measurements: M, largest number of them that is measured at a time.
+        """
+        return cls(
+            filter=FilterConfig(
+                landmark_kinds=(JUNCTION,),
+                linearisation="invariant",
+                max_landmarks=num_landmarks,
+                max_updates=max_measurements,
+                max_new=max_measurements,
+            ),
+        )
+
     def check(self) -> None:
-        """Raise unless the stages fit each other.
+        """Raise unless each stage is possible, and they fit each other.
 
         Raises:
-            ValueError: The field of view of the filter is not that of the scanner.
+            ValueError: A number or an option of a stage is out of range; or the field of view of
+                the filter is not that of the scanner.
         """
+        frontend_config.check_config(self.frontend)
+        filter_config.check_config(self.filter)
+        check_scan_match_spec(self.scan_matching, "config.scan_matching")
+        check_loop_closure_spec(self.loop_closure)
         own, scanner = self.filter.field_of_view, field_of_view(self.frontend.lidar)
         if own != scanner:
             raise ValueError(

@@ -19,26 +19,22 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching import loop_closure
 from jaxslam.matching.loop_closure import LoopClosures
-from jaxslam.pipeline import online
+from jaxslam.pipeline import arguments, chunks, online
+from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.online import (
-    CHUNK,
-    ChunkResult,
-    SlamState,
-    _chunk_at,
-    _filter,
-    _front_end,
-    init,
-)
-from jaxslam.smoothing import numbering, problem, sparse
-from jaxslam.smoothing.problem import SmoothingProblem
+from jaxslam.pipeline.online import SlamState
+from jaxslam.smoothing import numbering, sparse
+from jaxslam.smoothing import problem as smoothing_problem
+from jaxslam.smoothing.problem import SmoothingProblem, SmoothingResult
 
-MAX_CLOSURE_ROUNDS = (
-    2  # searches for loop closures at most, each from the trajectory smoothed before it;
-)
+# Searches for loop closures at most, each from the trajectory smoothed before it.
+MAX_CLOSURE_ROUNDS = 2
 CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further than this
-PADDING_MULTIPLE = (
-    512  # numbers of scans and landmarks are padded to multiples of this to be smoothed
+# Numbers of scans and landmarks are padded to multiples of this to be smoothed.
+PADDING_MULTIPLE = 512
+
+_build_problem = trace_cache.jit(
+    smoothing_problem.build_problem, static_argnames="untrusted_inflation"
 )
 
 
@@ -52,7 +48,7 @@ class SlamResult(NamedTuple):
         info: [T] diagnostics of the filter, with its estimates at the time.
         features: [T] features.
         topological_map: Topological map.
-        scan_matches: [T] motions by scan matching, where scans were matched.
+        scan_matches: [T] increments by scan matching, where scans were matched.
         loop_closures: Loop closures that the trajectory was smoothed with, where there were any.
     """
 
@@ -68,65 +64,78 @@ class SlamResult(NamedTuple):
 def run_slam(
     config: Config,
     params: NoiseParams,
-    pose: Array,
-    odometry: Array,
-    scans: Scan,
+    odometry: Any,
+    ranges: Any,
     *,
-    match_scans: bool = False,
-    smooth: bool = False,
+    start: Any = None,
+    match_scans: bool = True,
+    smooth: bool = True,
     callback: Callable[[SlamState, ChunkResult], Any] | None = None,
 ) -> SlamResult:
     """Run SLAM on a whole log.
 
     The filter estimates each pose from the measurements up to it. With `smooth`, all poses and
-    landmarks are estimated from all measurements (`sparse.smooth_log`), and where scans are matched,
-    loops are closed by matching scans of later visits with those of earlier ones (`loop_closure.find_loop_closures`).
+    landmarks are estimated from all measurements (`sparse.smooth_log`), and where scans are
+    matched, loops are closed by matching scans of later visits with those of earlier ones
+    (`loop_closure.find_loop_closures`).
 
     Args:
-        config: Of front end and filter; `landmarks` is the largest number of landmarks of the map.
-        params: Noise parameters of the filter.
-        pose: (3,) [m, m, rad] first pose, map frame.
-        odometry: (T, 3) [m, m, rad] odometry since the scan before, zero at the first.
-        scans: [T].
-        match_scans: Whether scans are to be matched, and the motions fused with the odometry.
-        smooth: Whether the trajectory is to be smoothed at the end.
-        callback: Callback, called after each chunk with the state and the result of the chunk.
+        config: For the scanner, as `Config.for_laser_log` makes it; `config.filter.max_landmarks`
+            is the largest size of the map.
+        params: Q and R of the filter, as `NoiseParams.for_laser_log(match_scans=True)`.
+        odometry: (T, 3) [m, m, rad] increments: the motion since the scan before, in the frame of
+            the pose before, zero at the first; `core.se2_np.increments` makes them from poses.
+        ranges: (T, R) raw ranges [m] of the scanner's R beams; NaN, infinite, not above zero or not
+            below `range_max` is no return. Or a `Scan` [T].
+        start: (3,) [m, m, rad] first pose, map frame; zero by default.
+        match_scans: Whether scans are matched, and the increments fused with the odometry.
+        smooth: Whether the trajectory is smoothed at the end.
+        callback: Called after each chunk with the state and the result of the chunk.
 
     Raises:
-        ValueError: There is no scan; or scans are to be matched and `params.alignment` is None.
+        ValueError: An argument has another shape, or does not fit the others; the odometry holds
+            poses; or scans are matched and `params.scan_match_std_scale` is None.
     """
+    arguments.check_config(config)
+    params = arguments.as_params(params, match_scans=match_scans)
+    increments = arguments.as_log_odometry(odometry)
     # NumPy, as each slice of a JAX array would be compiled.
-    odometry, scans = np.asarray(odometry), jax.tree.map(np.asarray, scans)
-    mapper, parts = init(config, pose, match_scans=match_scans), []
-    following = _front_end(config, mapper.submap, *_chunk_at(0, odometry, scans))
-    for first in range(0, len(odometry), CHUNK):
-        chunk, after = following, first + CHUNK
-        if after < len(odometry):  # in the background while the filter works on this chunk
-            following = _front_end(config, chunk.local, *_chunk_at(after, odometry, scans))
-        mapper, part = _filter(config, params, mapper, chunk)
+    scans = arguments.as_scans(config.frontend.lidar, ranges, len(increments))
+    pose = arguments.as_start(start)
+    state, parts = online.init(config, pose, match_scans=match_scans), []
+    following = chunks.extract_chunk(config, state.submap, *chunks.chunk_at(0, increments, scans))
+    for first in range(0, len(increments), chunks.CHUNK):
+        chunk, after = following, first + chunks.CHUNK
+        if after < len(increments):  # in the background while the filter works on this chunk
+            some = chunks.chunk_at(after, increments, scans)
+            following = chunks.extract_chunk(config, chunk.submap, *some)
+        state, part = online.advance(config, params, state, chunk)
         parts.append(part)
         if callback is not None:
-            callback(mapper, part)
-    info, features, matched = jax.tree.map(lambda *chunks: np.concatenate(chunks), *parts)
-    poses, found = np.asarray(info.pose, np.float64), None
+            callback(state, part)
+    info, features, matches = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    poses, closures = np.asarray(info.pose, np.float64), None
     if smooth:
-        inputs = Measurement(odometry.astype(info.pose.dtype), features, scan_match=matched)
-        to_close = scans if match_scans else None
-        poses, belief, found = smooth_result(
-            config, params, pose, inputs, info, mapper.belief, to_close
+        own: Any = increments.astype(info.pose.dtype)  # NumPy, like the rest
+        measurements = Measurement(own, features, scan_match=matches)
+        poses, belief, closures = smooth_result(
+            config,
+            params,
+            pose,
+            measurements,
+            info,
+            state.belief,
+            scans if match_scans else None,
         )
-        mapper = mapper._replace(belief=belief)
-    topological_map = online.topological_map(config, mapper, poses)
-    return SlamResult(poses, mapper.belief, info, features, topological_map, matched, found)
-
-
-_build_problem = trace_cache.jit(problem.build_problem, static_argnames="untrusted_inflation")
+        state = state._replace(belief=belief)
+    topological_map = online.topological_map(config, state, poses)
+    return SlamResult(poses, state.belief, info, features, topological_map, matches, closures)
 
 
 def smooth_result(
     config: Config,
     params: NoiseParams,
-    pose: Array,
+    start: Array,
     measurements: Measurement,
     info: StepInfo,
     belief: Belief,
@@ -135,14 +144,14 @@ def smooth_result(
     """Smooth a filtered trajectory by all its measurements.
 
         smooth with the filter's data association
-        up to ROUNDS times:
+        up to `MAX_CLOSURE_ROUNDS` times:
             find loop closures from the smoothed trajectory, smooth again with them
-            stop if no pose has moved by STILL or more
+            stop if no pose has moved by `CLOSURE_CONVERGED` or more
 
     Args:
-        config: Of the filter.
-        params: Noise parameters of the filter.
-        pose: (3,) [m, m, rad] first pose, map frame.
+        config: Of the filter, of scan matching and of loop closures.
+        params: Q and R of the filter.
+        start: (3,) [m, m, rad] first pose, map frame.
         measurements: [T] measurements of the filter, NumPy.
         info: [T] its diagnostics, NumPy.
         belief: After the last scan.
@@ -153,34 +162,70 @@ def smooth_result(
         covariance of the filter; and the loop closures, None without scans.
 
     Raises:
-        ValueError: There are scans, and `params.alignment` is None.
+        ValueError: There are scans, and `params.scan_match_std_scale` is None.
     """
-    if scans is not None and params.scan_match_std_scale is None:
-        raise ValueError("noise.alignment is None, and there are scans to close loops with")
+    params = arguments.as_params(params, match_scans=scans is not None)
     steps = len(info.pose)
-    capacity = _padded(np.count_nonzero(np.unique(info.id) >= 0))
-    found = numbering.number_landmarks(info.id, info.pose, measurements.features, capacity=capacity)
-    records, guess = _padded_records(
-        config, params, pose, measurements, found.landmark_index, info.pose
+    capacity = _padded(int(np.count_nonzero(np.unique(info.id) >= 0)))
+    numbered = numbering.number_landmarks(
+        info.id, info.pose, measurements.features, capacity=capacity
     )
-    track, closed = sparse.smooth_log(records, guess, found.positions), None
-    for _ in range(0 if scans is None else MAX_CLOSURE_ROUNDS):
-        before = track.poses
-        closed = loop_closure.find_loop_closures(
+    problem, guess = _padded_problem(
+        config.filter.untrusted_inflation,
+        params,
+        start,
+        measurements,
+        numbered.landmark_index,
+        np.asarray(info.pose),
+    )
+    smoothed = sparse.smooth_log(problem, guess, numbered.positions)
+    closures = None
+    std_scale = params.scan_match_std_scale
+    if scans is not None and std_scale is not None:
+        smoothed, closures = _close_loops(
+            config, problem, smoothed, scans, num_scans=steps, std_scale=float(std_scale)
+        )
+    poses, positions = map(np.asarray, (smoothed.poses[:steps], smoothed.landmark_positions))
+    positions = _positions_of(belief, np.asarray(numbered.id), positions)
+    mean = np.concatenate([poses[-1], positions.ravel()])
+    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype)), closures
+
+
+def _close_loops(
+    config: Config,
+    problem: SmoothingProblem,
+    smoothed: SmoothingResult,
+    scans: Scan,
+    *,
+    num_scans: int,
+    std_scale: float,
+) -> tuple[SmoothingResult, LoopClosures]:
+    """Smooth with loop closures that are found from the smoothed trajectory, until it is at rest.
+
+    Args:
+        config: Of scan matching and of loop closures.
+        problem: Padded.
+        smoothed: Without loop closures.
+        scans: [T].
+        num_scans: T.
+        std_scale: Factor on the standard deviation of scan matching.
+    """
+    for _ in range(MAX_CLOSURE_ROUNDS):
+        before = smoothed
+        closures = loop_closure.find_loop_closures(
             config.loop_closure,
             config.scan_matching,
             config.frontend.lidar,
-            before[:steps],
+            before.poses[:num_scans],
             scans,
-            std_scale=float(params.scan_match_std_scale),
+            std_scale=std_scale,
         )
-        track = sparse.smooth_log(records, before, track.landmark_positions, loop_closures=closed)
-        if np.max(np.abs(track.poses - before)[:, :2]) < CLOSURE_CONVERGED:
+        smoothed = sparse.smooth_log(
+            problem, before.poses, before.landmark_positions, loop_closures=closures
+        )
+        if np.max(np.abs(smoothed.poses - before.poses)[:, :2]) < CLOSURE_CONVERGED:
             break
-    poses = track.poses[:steps]
-    positions = _positions_of(belief, np.asarray(found.id), track.landmark_positions)
-    mean = np.concatenate([poses[-1], positions.ravel()])
-    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype)), closed
+    return smoothed, closures
 
 
 def _padded(count: int) -> int:
@@ -188,33 +233,35 @@ def _padded(count: int) -> int:
     return (count // PADDING_MULTIPLE + 1) * PADDING_MULTIPLE
 
 
-def _padded_records(
-    config: Config,
-    noise: NoiseParams,
+def _padded_problem(
+    untrusted_inflation: float,
+    params: NoiseParams,
     start: Array,
-    inputs: Measurement,
-    which: Array,
-    guess: np.ndarray,
+    measurements: Measurement,
+    landmark_index: Array,
+    poses: np.ndarray,
 ) -> tuple[SmoothingProblem, np.ndarray]:
     """Smoothing problem and guess (P, 3), padded by steps without motion and measurements.
 
     Args:
-        config: Of the filter.
-        noise: Noise parameters of the filter.
+        untrusted_inflation: Of the filter's configuration.
+        params: Q and R of the filter.
         start: (3,) first pose.
-        inputs: [T].
-        which: (T, M) landmark of each feature.
-        guess: (T, 3) poses.
+        measurements: [T].
+        landmark_index: (T, M) landmark of each feature.
+        poses: (T, 3) guess.
     """
-    steps = len(guess)
-    inputs, which, guess = pad_to((inputs, np.asarray(which), guess), to=_padded(steps))
-    which[steps:] = -1
-    inputs.odometry[steps:] = 0.0
-    if inputs.scan_match is not None:
-        inputs.scan_match.increment[steps:] = 0.0
-    return _build_problem(
-        noise, start, inputs, which, doubt=config.filter.untrusted_inflation
-    ), guess
+    steps = len(poses)
+    given = measurements, np.asarray(landmark_index), poses
+    measurements, index, guess = pad_to(given, to=_padded(steps))
+    index[steps:] = -1
+    measurements.odometry[steps:] = 0.0
+    if measurements.scan_match is not None:
+        measurements.scan_match.increment[steps:] = 0.0
+    problem = _build_problem(
+        params, start, measurements, index, untrusted_inflation=untrusted_inflation
+    )
+    return problem, guess
 
 
 def _positions_of(belief: Belief, ids: np.ndarray, smoothed_positions: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Simulated drives: a robot that follows a path, its odometry and its scans."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,12 @@ from jax import lax
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
-from jaxslam.core.scan import Scan
+from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import compose
 from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
-from jaxslam.pipeline.config import Config
-from jaxslam.simulation import path_following, ray_casting
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.simulation import arguments, path_following, ray_casting
 from jaxslam.simulation.robot import Robot, true_increment
 from jaxslam.simulation.worlds import World
 
@@ -23,8 +24,13 @@ SUBSTEPS = 4  # parts of the motion between two scans with encoder noise of thei
 
 
 def start_pose(path: Array) -> Array:
-    """Pose (3,) at the beginning of a path (N, 2) [m, world], heading along it."""
-    along = path[5] - path[0]
+    """Pose (3,) at the beginning of a path (N, 2) [m, world], heading along it.
+
+    Raises:
+        ValueError: The path has too few points; while tracing.
+    """
+    arguments.check_path(path)
+    along = path[arguments.MIN_PATH_POINTS - 1] - path[0]
     return jnp.append(path[0], jnp.arctan2(along[1], along[0]))
 
 
@@ -44,7 +50,7 @@ def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array
     first = start_pose(path)
     draws = jax.random.normal(key, (num_scans - 1, SUBSTEPS, 2), path.dtype)
 
-    def body(carry, draw):
+    def body(carry: tuple[Array, Array], draw: Array) -> tuple[tuple[Array, Array], Any]:
         pose, path_index = carry
         odometry, path_index = path_following.pure_pursuit(path, path_index, pose)
         pose = compose(pose, true_increment(robot, draw, odometry))
@@ -54,46 +60,45 @@ def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array
     return jnp.concatenate([first[None], poses]), jnp.pad(odometry, ((1, 0), (0, 0)))
 
 
-def num_scans_of_drive(robot: Robot, path: Array) -> int:
+def num_scans_of_drive(robot: Robot, path: Any) -> int:
     """Number of scans on a noise-free drive to the end of a path (N, 2)."""
-    upper_bound = 40 + int(4 * np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)) / 0.3)
-    noise_free = robot._replace(encoder_noise=0.0)
+    points = arguments.as_path(path, None)
+    noise_free = arguments.as_robot(robot)._replace(encoder_noise=0.0)
+    upper_bound = 40 + int(4 * np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)) / 0.3)
     simulated = jax.jit(partial(drive, num_scans=upper_bound), static_argnums=1)
-    _, odometry = simulated(jax.random.key(0), noise_free, path)
+    _, odometry = simulated(jax.random.key(0), noise_free, points)
     moving = np.abs(np.asarray(odometry)[1:]).sum(axis=1) > 0
     return 1 + int(moving.sum())
 
 
 def simulate_episode(
-    key: Key, config: Config, robot: Robot, world: World, path: Array, *, num_scans: int
+    key: Key, config: FrontendConfig, robot: Robot, world: World, path: Array, *, num_scans: int
 ) -> Episode:
     """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features."""
-    truth, odometry, scan_keys = _drive(key, robot, path, steps=num_scans)
+    truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
 
     def features(item: tuple[Array, Key]) -> Features:
-        return extract.extract_features(config.frontend, _scan(config, world, *item))
+        return extract.extract_features(config, _scan(config.lidar, world, *item))
 
     extracted = map_batches(features, (truth, scan_keys), batch_size=extract.SCAN_BATCH)
     return Episode(truth=truth, odometry=odometry, features=extracted)
 
 
 def simulate_scans(
-    key: Key, config: Config, robot: Robot, world: World, path: Array, *, num_scans: int
+    key: Key, lidar: Lidar, robot: Robot, world: World, path: Array, *, num_scans: int
 ) -> tuple[Array, Array, Scan]:
     """True poses (T, 3), odometry increments (T, 3) and scans [T] of `simulate_episode`."""
-    truth, odometry, scan_keys = _drive(key, robot, path, steps=num_scans)
-    return truth, odometry, lax.map(lambda x: _scan(config, world, *x), (truth, scan_keys))
+    truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
+    return truth, odometry, lax.map(lambda x: _scan(lidar, world, *x), (truth, scan_keys))
 
 
-def _drive(key: Key, robot: Robot, path: Array, *, steps: int) -> tuple[Array, Array, Key]:
+def _drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array, Array, Key]:
     """True poses (T, 3), odometry increments (T, 3), and a key (T,) for each scan."""
     drive_key, scan_key = jax.random.split(key)
-    truth, odometry = drive(drive_key, robot, path, num_scans=steps)
-    return truth, odometry, jax.random.split(scan_key, steps)
+    truth, odometry = drive(drive_key, robot, path, num_scans=num_scans)
+    return truth, odometry, jax.random.split(scan_key, num_scans)
 
 
-def _scan(config: Config, world: World, pose: Array, key: Key) -> Scan:
+def _scan(lidar: Lidar, world: World, pose: Array, key: Key) -> Scan:
     """Noisy scan of the world from a pose (3,)."""
-    return ray_casting.add_range_noise(
-        key, config.frontend.lidar, ray_casting.cast(config.frontend.lidar, world, pose)
-    )
+    return ray_casting.add_range_noise(key, lidar, ray_casting.cast(lidar, world, pose))

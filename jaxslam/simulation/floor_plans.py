@@ -24,7 +24,7 @@ def _find_door(
 
     def opens_into(room: Box, side: int, position: float, start: float) -> bool:
         return (
-            np.isclose(room[side], position)
+            bool(np.isclose(room[side], position))
             and room[across] <= start - 0.1
             and start + width + 0.1 <= room[across + 2]
         )
@@ -33,10 +33,9 @@ def _find_door(
     for _ in range(50):
         start = rng.uniform(box[across] + 0.2, box[across + 2] - 0.2 - width)
         if all(any(opens_into(room, *side, start) for room in rooms) for side in sides):
-            door = [0.0] * 4
-            door[axis], door[axis + 2] = cut, cut + thick
-            door[across], door[across + 2] = start, start + width
-            return [tuple(door)]
+            along, beside = (cut, cut + thick), (start, start + width)
+            (x0, x1), (y0, y1) = (along, beside) if axis == 0 else (beside, along)
+            return [(x0, y0, x1, y1)]
     return []
 
 
@@ -54,9 +53,9 @@ def _rooms(rng: np.random.Generator, box: Box, thick: float) -> tuple[list[Box],
     if size[axis] < 2 * MIN_ROOM_SIDE + thick or size.prod() < rng.uniform(8.0, 22.0):
         return [box], []
     cut = rng.uniform(box[axis] + MIN_ROOM_SIDE, box[axis + 2] - MIN_ROOM_SIDE - thick)
-    low, high = list(box), list(box)
-    low[axis + 2], high[axis] = cut, cut + thick
-    halves = [_rooms(rng, tuple(half), thick) for half in (low, high)]
+    low = (x0, y0, cut, y1) if axis == 0 else (x0, y0, x1, cut)
+    high = (cut + thick, y0, x1, y1) if axis == 0 else (x0, cut + thick, x1, y1)
+    halves = [_rooms(rng, half, thick) for half in (low, high)]
     rooms, doors = (halves[0][k] + halves[1][k] for k in range(2))
     return rooms, [*doors, *_find_door(rng, rooms, box, axis, cut, thick)]
 

@@ -1,29 +1,36 @@
 """A path followed by pure pursuit."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.se2 import inverse_transform, range_bearing
-from jaxslam.core.types import Array
+from jaxslam.core.types import Array, as_float64
 from jaxslam.simulation.robot import arc_increment
 
 SEARCH_WINDOW = 40  # points of the path ahead of the robot that are searched
-TURN_ON_SPOT_ANGLE = (
-    0.6  # [rad] the robot turns on the spot to a target at a larger bearing than this
-)
+LOOKAHEAD = 0.5  # [m] along the path from the point nearest to the robot to its target
+TURN_ON_SPOT_ANGLE = 0.6  # [rad] the robot turns on the spot to a target at a larger bearing
 GOAL_TOLERANCE = 0.05  # [m] the robot stops this close to the end of the path
 
 
-def densify(waypoints: np.ndarray, spacing: float = 0.05) -> np.ndarray:
+def densify(waypoints: Any, spacing: float = 0.05) -> np.ndarray:
     """Points (N, 2) about `spacing` [m] apart on the straight lines that join waypoints (K, 2) [m].
 
     The waypoints are among them.
 
     Raises:
-        ValueError: The waypoints have another shape.
+        ValueError: The waypoints have another shape or are not finite, or the spacing is not above
+            zero.
     """
-    if np.ndim(waypoints) != 2 or len(waypoints) < 1 or np.shape(waypoints)[1] != 2:
-        raise ValueError(f"waypoints is {np.shape(waypoints)}, not (K >= 1, 2)")
+    waypoints = as_float64("waypoints", waypoints, ("K", 2))
+    if not len(waypoints):
+        raise ValueError("waypoints is empty; one at least is expected")
+    if not np.isfinite(waypoints).all():
+        raise ValueError("waypoints holds numbers that are not finite")
+    if not spacing > 0.0:
+        raise ValueError(f"spacing is {spacing}, not above 0")
     legs = np.hypot(*np.diff(waypoints, axis=0).T)
     at_waypoint = np.concatenate([[0.0], np.cumsum(legs)])
     wanted = np.linspace(0.0, at_waypoint[-1], round(at_waypoint[-1] / spacing) + 1)
@@ -36,7 +43,7 @@ def pure_pursuit(
     index: Array,
     pose: Array,
     *,
-    lookahead: float = 0.5,
+    lookahead: float = LOOKAHEAD,
     max_step: float = 0.3,
     max_turn: float = 0.2,
 ) -> tuple[Array, Array]:
@@ -52,7 +59,8 @@ def pure_pursuit(
           robot -> ahead
 
     Args:
-        path: (N, 2) points of the path [m, map frame]; `SEARCH_WINDOW` of them must span the lookahead.
+        path: (N, 2) points of the path [m, map frame]; `SEARCH_WINDOW` of them must span the
+            lookahead.
         index: () int32 index of the path point that was nearest at the last call, 0 at the first.
         pose: (3,) [m, m, rad] of the robot, map frame.
         lookahead: [m] distance along the path from the nearest path point to the target.
@@ -93,8 +101,8 @@ def _nearest_and_target(
 ) -> tuple[Array, Array]:
     """Indices () of the path point nearest to the robot, and of the first `lookahead` [m] on.
 
-    Both are searched in a window of `SEARCH_WINDOW` points, so that a path that crosses itself is followed
-    in order.
+    Both are searched in a window of `SEARCH_WINDOW` points, so that a path that crosses itself is
+    followed in order.
     """
     last = path.shape[0] - 1
     index = jnp.minimum(previous + jnp.arange(SEARCH_WINDOW, dtype=previous.dtype), last)

@@ -13,16 +13,16 @@ SEAM = 1e-5  # fraction of its length by which a wall is lengthened at either en
 
 
 def cast(lidar: Lidar, world: World, pose: Array) -> Scan:
-    """Noise-free scan of `worlds` from `pose` (3,).
+    """Noise-free scan of a world from a pose.
 
     A beam along unit vector u from p meets the wall a + s (b - a), 0 <= s <= 1, at the distance
     t = (a - p) x (b - a) / (u x (b - a)). Walls are lengthened by `SEAM`, so that no beam passes
     between two that share a corner.
 
     Args:
-        world: The walls.
-        pose: (3,) [m, m, rad] of the lidar in the world.
         lidar: The scanner.
+        world: The walls.
+        pose: (3,) [m, m, rad] of the scanner in the world.
 
     Raises:
         ValueError: Walls or pose have another shape or type; while tracing.
@@ -30,8 +30,9 @@ def cast(lidar: Lidar, world: World, pose: Array) -> Scan:
     check_array("world.walls", world.walls, ("S", 4), jnp.floating)
     check_array("pose", pose, (3,), jnp.floating)
     beam = unit_vector(pose[2] + beam_angles(lidar))[:, None, :]  # (R, 1, 2)
-    start = (world.walls[:, :2] - pose[None, :2])[None]  # (1, S, 2)
-    along = (world.walls[:, 2:] - world.walls[:, :2])[None]  # (1, S, 2)
+    walls = jnp.asarray(world.walls)
+    start = (walls[:, :2] - pose[None, :2])[None]  # (1, S, 2)
+    along = (walls[:, 2:] - walls[:, :2])[None]  # (1, S, 2)
     slope = cross(beam, along)  # (R, S)
     crosses = jnp.abs(slope) > 1e-9
     safe = jnp.where(crosses, slope, 1.0)

@@ -37,7 +37,7 @@ def wheel_increment(left: Array, right: Array, base: float) -> Array:
 
 
 def wheel_distances(motion: Array, base: float) -> tuple[Array, Array]:
-    """Distances left and right [m] that the wheels roll along the arc `robot` (3,).
+    """Distances left and right [m] that the wheels roll along an arc, the motion (3,).
 
     The inverse of `wheel_increment`.
     """
@@ -58,7 +58,7 @@ def wheel_std(distance: Array, noise: float) -> Array:
 
 
 def true_increment(robot: Robot, draws: Array, motion: Array) -> Array:
-    """True motion (3,) of a robot whose encoders read the arc `robot` (3,).
+    """True motion (3,) of a robot whose encoders read an arc, the motion (3,).
 
     Args:
         robot: Wheel base and encoder noise.

@@ -13,56 +13,112 @@ from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode
 from jaxslam.core.scan import Scan
 from jaxslam.core.types import Array, Key
+from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend.config import FrontendConfig
 from jaxslam.pipeline import offline
+from jaxslam.pipeline.arguments import as_params, check_config
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_episodes
+from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
 from jaxslam.pipeline.offline import SlamResult
-from jaxslam.simulation.drives import simulate_episode, simulate_scans
+from jaxslam.simulation import arguments
+from jaxslam.simulation.drives import num_scans_of_drive, simulate_episode, simulate_scans
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
+
+ROBOT = Robot()  # the default one
+
+
+class _Drive(NamedTuple):
+    """What is driven, checked.
+
+    Attributes:
+        robot: With its encoder noise.
+        world: The walls.
+        path: (N, 2) [m, world].
+        num_scans: T, number of scans.
+    """
+
+    robot: Robot
+    world: World
+    path: Array
+    num_scans: int
+
+
+def _drive_of(
+    key: Key, config: Config, robot: Robot, world: str | World, path: Any, num_scans: int | None
+) -> _Drive:
+    """The drive that the arguments of the functions below describe.
+
+    Raises:
+        ValueError: One of them is not possible; the message names it.
+    """
+    arguments.check_key(key)
+    check_config(config)
+    robot, walls = arguments.as_robot(robot), arguments.as_world(world)
+    points = arguments.as_path(path, world)
+    if num_scans is None:
+        return _Drive(robot, walls, points, num_scans_of_drive(robot, points))
+    return _Drive(robot, walls, points, arguments.as_count("num_scans", num_scans))
 
 
 def replay_trial(
     key: Key,
     config: Config,
-    robot: Robot,
     params: NoiseParams,
-    world: World,
-    path: Array,
+    robot: Robot = ROBOT,
+    world: str | World = "office",
+    path: Any = None,
     *,
     trial: int,
-    num_scans: int,
+    num_scans: int | None = None,
 ) -> tuple[Array, SlamResult]:
-    """Simulate one trial of an experiment again and run SLAM on it.
+    """Simulate one trial of an experiment again and run SLAM on it, without scan matching.
 
     Args:
         key: Key of the experiment; the other arguments, too, are those of `run_trials`.
         config: Of front end and filter.
         params: Q and R that the filter assumes.
-        world: The world.
         robot: The robot, with its encoder noise.
-        path: (N, 2) [m, world] to drive along.
-        trial: Number of the trial.
-        num_scans: T, number of scans.
+        world: Name of the world, or its walls.
+        path: (N, 2) [m, world] to drive along; the world's own by default.
+        trial: Number of the trial, from 0.
+        num_scans: T, number of scans; to the end of the path by default.
 
     Returns:
-        True poses (T, 3), and the result of `offline.run_slam`.
+        True poses (T, 3), and the result of `offline.run_slam`, not smoothed.
+
+    Raises:
+        ValueError: An argument is not possible.
     """
-    trial_key = trial_keys(key, jnp.array([trial]))[0]
+    params = as_params(params, match_scans=False)
+    given = _drive_of(key, config, robot, world, path, num_scans)
+    number = arguments.as_count("trial", trial, least=0)
+    trial_key = trial_keys(key, jnp.array([number]))[0]
 
     def scans_of(own: Key) -> tuple[Array, Array, Scan]:
-        return simulate_scans(own, config, robot, world, path, num_scans=num_scans)
+        lidar, (robot, world, path, num_scans) = config.frontend.lidar, given
+        return simulate_scans(own, lidar, robot, world, path, num_scans=num_scans)
 
     truth, odometry, scans = jax.jit(scans_of)(trial_key)
-    return truth, offline.run_slam(config, params, truth[0], odometry, scans)
+    result = offline.run_slam(
+        config, params, odometry, scans, start=truth[0], match_scans=False, smooth=False
+    )
+    return truth, result
 
 
-@partial(jax.jit, static_argnames=("config", "robot", "num_scans"))
 def simulate_keys(
     keys: Key, config: Config, robot: Robot, world: World, path: Array, *, num_scans: int
 ) -> Episode:
     """Simulate one trial of `num_scans` scans for each of the keys (B,)."""
+    return _simulate_keys(keys, config.frontend, robot, world, path, num_scans=num_scans)
+
+
+@partial(jax.jit, static_argnames=("config", "robot", "num_scans"))
+def _simulate_keys(
+    keys: Key, config: FrontendConfig, robot: Robot, world: World, path: Array, *, num_scans: int
+) -> Episode:
+    """`simulate_keys`, compiled for the front end alone."""
     return lax.map(
         lambda key: simulate_episode(key, config, robot, world, path, num_scans=num_scans), keys
     )
@@ -76,16 +132,35 @@ def trial_keys(key: Key, trials: Array) -> Key:
 def simulate_episodes(
     key: Key,
     config: Config,
-    robot: Robot,
-    world: World,
-    path: Array,
+    robot: Robot = ROBOT,
+    world: str | World = "office",
+    path: Any = None,
     *,
     num_trials: int,
-    num_scans: int,
+    num_scans: int | None = None,
 ) -> Episode:
-    """Simulate trials 0 to B - 1, each of `num_scans` scans along `path` (N, 2)."""
-    keys = trial_keys(key, jnp.arange(num_trials))
-    return simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+    """Simulate trials 0 to B - 1: drives of a robot along a path, and the features of its scans.
+
+    Args:
+        key: Key of the experiment; trial i has `trial_keys(key, i)`.
+        config: Of the front end.
+        robot: The robot, with its encoder noise.
+        world: Name of the world (`worlds.NAMES`), or its walls.
+        path: (N, 2) [m, world] to drive along, N >= 6; the world's own waypoints, densified, by
+            default.
+        num_trials: B, number of trials.
+        num_scans: T, scans of a trial; to the end of the path by default.
+
+    Returns:
+        [B] episodes.
+
+    Raises:
+        ValueError: An argument is not possible; the message says what is expected.
+    """
+    given = _drive_of(key, config, robot, world, path, num_scans)
+    keys = trial_keys(key, jnp.arange(arguments.as_count("num_trials", num_trials)))
+    robot, walls, points, steps = given
+    return simulate_keys(keys, config, robot, walls, points, num_scans=steps)
 
 
 class _Common(NamedTuple):
@@ -93,85 +168,112 @@ class _Common(NamedTuple):
 
     Attributes:
         key: Data of the experiment's key, which NumPy can hold.
-        noise: Q and R that the filter assumes.
+        params: Q and R that the filter assumes.
         world: The world.
         path: (N, 2) [m, world].
     """
 
     key: Array
-    noise: NoiseParams
+    params: NoiseParams
     world: World
     path: Array
 
 
-def _group_tracks(
-    config: Config, robot: Robot, steps: int, key_type: Any, common: _Common, numbers: Array
+def _filter_group(
+    frontend: FrontendConfig,
+    config: FilterConfig,
+    robot: Robot,
+    num_scans: int,
+    key_type: Any,
+    common: _Common,
+    numbers: Array,
 ) -> TrialResult:
-    """Simulate the trials with the numbers (RUNS,) in turn, and filter them together."""
+    """Simulate the trials with the numbers (EPISODE_BATCH,) in turn, and filter them together."""
     keys = trial_keys(jax.random.wrap_key_data(common.key, impl=key_type), numbers)
-    logs = simulate_keys(keys, config, robot, common.world, common.path, num_scans=steps)
-    return filter_episodes(config, common.noise, logs)
+    episodes = _simulate_keys(keys, frontend, robot, common.world, common.path, num_scans=num_scans)
+    return filter_batch(config, common.params, episodes)
 
 
-_spread_groups = DeviceMap(_group_tracks, size=1, static=4)
+_SPREAD_GROUPS = DeviceMap(_filter_group, size=1, static=5)
 
 
 def run_trials(
     key: Key,
     config: Config,
-    robot: Robot,
     params: NoiseParams,
-    world: World,
-    path: Array,
+    robot: Robot = ROBOT,
+    world: str | World = "office",
+    path: Any = None,
     *,
     num_trials: int,
-    num_scans: int,
+    num_scans: int | None = None,
     first: int = 0,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[TrialResult]:
-    """Simulate and filter trials `first` to B - 1; yield their tracks in order, some at a time.
+    """Simulate and filter trials `first` to B - 1; yield results in order, some at a time.
 
-    A round gives each of D devices one group of RUNS trials. Round i + 1 is queued before round i
-    is waited for, so devices work while the caller has the results of round i:
+    A round gives each of D devices one group of `EPISODE_BATCH` trials. Round i + 1 is queued
+    before round i is waited for, so devices work while the caller has the results of round i:
 
         host      queue 0, 1 | wait 0 | yield 0 | queue 2 | wait 1 | yield 1 | wait 2 | yield 2
         devices     | round 0         | round 1           | round 2          |
 
     Memory is bounded by two rounds. The result of a trial depends neither on how many there are
     nor on where it runs, bit for bit where devices are alike. With several processes all must
-    call it with the same arguments, and all get all tracks, which hold NumPy arrays.
+    call it with the same arguments, and all get all results, which hold NumPy arrays.
 
     Args:
         key: Key of the experiment; trial i has `trial_keys(key, i)`.
         config: Of front end and filter.
         params: Q and R that the filter assumes.
-        world: The world.
         robot: The robot, with its encoder noise.
-        path: (N, 2) [m, world] to drive along.
+        world: Name of the world (`worlds.NAMES`), or its walls.
+        path: (N, 2) [m, world] to drive along, N >= 6; the world's own waypoints, densified, by
+            default.
         num_trials: B, number of trials.
-        num_scans: T, scans of a trial.
+        num_scans: T, scans of a trial; to the end of the path by default.
         first: Number of the first trial; those before it were done by another call.
         devices: To be used; all, of all processes, by default.
+
+    Raises:
+        ValueError: An argument is not possible; at the call, before the first result is asked for.
     """
-    devices = jax.devices() if devices is None else devices
-    common = _Common(jax.random.key_data(key), params, world, path)
+    params = as_params(params, match_scans=False)
+    given = _drive_of(key, config, robot, world, path, num_scans)
+    total = arguments.as_count("num_trials", num_trials)
+    begin = arguments.as_count("first", first, least=0)
+    if devices is not None and not len(devices):
+        raise ValueError("devices is empty; None stands for all")
+    used = jax.devices() if devices is None else devices
+    return _run_groups(key, config, params, given, begin, total, used)
+
+
+def _run_groups(
+    key: Key,
+    config: Config,
+    params: NoiseParams,
+    given: _Drive,
+    first: int,
+    num_trials: int,
+    devices: Sequence[jax.Device],
+) -> Iterator[TrialResult]:
+    """The loop of `run_trials`, whose arguments are checked."""
+    common = _Common(jax.random.key_data(key), params, given.world, given.path)
+    static = config.frontend, config.filter, given.robot, given.num_scans, jax.random.key_impl(key)
     per_round = EPISODE_BATCH * len(devices)
-    key_type = jax.random.key_impl(key)
 
     def begin(start: int) -> Callable[[], TrialResult]:
         # The last round is filled up with its last trial, so that nothing is compiled again.
         numbers = np.minimum(start + np.arange(per_round, dtype=np.int32), num_trials - 1)
         groups = numbers.reshape(-1, EPISODE_BATCH)
-        return _spread_groups.begin(
-            config, robot, num_scans, key_type, common, groups, devices=devices
-        )
+        return _SPREAD_GROUPS.begin(*static, common, groups, devices=devices)
 
     def end(start: int, finish: Callable[[], TrialResult]) -> TrialResult:
         wanted = slice(max(0, first - start), num_trials - start)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[wanted], finish())
 
     pending = None
-    # Groups begin at multiples of RUNS, whatever `first` is.
+    # Groups begin at multiples of EPISODE_BATCH, whatever `first` is.
     for start in range(first - first % EPISODE_BATCH, num_trials, per_round):
         following = start, begin(start)
         if pending is not None:

@@ -1,13 +1,18 @@
 """Simulated environments: those of the paper's figures, an office, and random floor plans."""
 
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from jaxslam.core.types import Array
+from jaxslam.core.types import AnyArray
 
+T = TypeVar("T")
 Box = tuple[float, float, float, float]
 """Axis-aligned rectangle x0, y0, x1, y1 [m], with x0 < x1 and y0 < y1."""
+
+Point = tuple[float, float]
+"""A point x, y [m]."""
 
 
 class World(NamedTuple):
@@ -17,10 +22,10 @@ class World(NamedTuple):
         walls: (S, 4) [m] ends x1, y1, x2, y2, world frame.
     """
 
-    walls: Array
+    walls: AnyArray
 
 
-def covers(boxes: list[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def covers(boxes: Sequence[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether each point (x, y) of a grid is in one of the boxes: (len(x), len(y)) bool."""
     inside = np.zeros((len(x), len(y)), bool)
     for x0, y0, x1, y1 in boxes:
@@ -28,13 +33,13 @@ def covers(boxes: list[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return inside
 
 
-def strokes(edge: np.ndarray, ends: np.ndarray) -> list[tuple[float, float]]:
+def strokes(edge: np.ndarray, ends: np.ndarray) -> list[Point]:
     """First and last coordinate of each interval of True in `edge` (n,), given `ends` (n + 1,)."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], edge, [False]]).astype(int)))
     return [(ends[first], ends[last]) for first, last in change.reshape(-1, 2)]
 
 
-def outline(free: list[Box], solid: list[Box] = ()) -> np.ndarray:
+def outline(free: Sequence[Box], solid: Sequence[Box] = ()) -> np.ndarray:
     """Walls (S, 4) [m] around the union of the boxes `free`, less the boxes `solid`.
 
     The sides of the boxes cut the plane into cells that are free or not. Walls separate the two,
@@ -43,7 +48,7 @@ def outline(free: list[Box], solid: list[Box] = ()) -> np.ndarray:
     boxes = np.array([*free, *solid])
     x, y = np.unique(boxes[:, [0, 2]]), np.unique(boxes[:, [1, 3]])
     middle_x, middle_y = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
-    inside = covers(free, middle_x, middle_y) & ~covers(list(solid), middle_x, middle_y)
+    inside = covers(free, middle_x, middle_y) & ~covers(solid, middle_x, middle_y)
     change_x = np.diff(np.pad(inside, 1).astype(int), axis=0)[:, 1:-1]  # across the lines x
     change_y = np.diff(np.pad(inside, 1).astype(int), axis=1)[1:-1]  # across the lines y
     walls = []
@@ -55,10 +60,10 @@ def outline(free: list[Box], solid: list[Box] = ()) -> np.ndarray:
     return np.array(walls)
 
 
-def polyline(points: list[tuple[float, float]]) -> np.ndarray:
+def polyline(points: Sequence[Point] | np.ndarray) -> np.ndarray:
     """Walls (N - 1, 4) [m] that join N points in order."""
-    points = np.array(points)
-    return np.hstack([points[:-1], points[1:]])
+    joints = np.array(points)
+    return np.hstack([joints[:-1], joints[1:]])
 
 
 def object_ahead() -> np.ndarray:
@@ -66,9 +71,7 @@ def object_ahead() -> np.ndarray:
     return outline([(-0.5, -2.0, 3.0, 2.0)], [(1.4, 0.3, 2.0, 0.9)])
 
 
-def corridor(
-    left: list[tuple[float, float]] = (), right: list[tuple[float, float]] = ()
-) -> np.ndarray:
+def corridor(left: Sequence[Point] = (), right: Sequence[Point] = ()) -> np.ndarray:
     """Fig. 6: walls 2.4 m apart from x = -0.5 to 6 m, with given points between their ends."""
     return np.vstack(
         [
@@ -88,10 +91,10 @@ def column() -> np.ndarray:
     return corridor(left=[(2.5, 1.2), (2.5, 0.7), (3.0, 0.7), (3.0, 1.2)])
 
 
-def stairs(at: list[float], out: list[float]) -> list[tuple[float, float]]:
-    """Points of a wall with steps at x = `at` (N,) [m], between levels y = `out` (N + 1,) [m]."""
-    levels = zip(out[:-1], out[1:], strict=True)
-    return [(x, y) for x, before_after in zip(at, levels, strict=True) for y in before_after]
+def stairs(x: list[float], levels: list[float]) -> list[Point]:
+    """Points of a wall with steps at x (N,) [m], between levels y (N + 1,) [m]."""
+    steps = zip(levels[:-1], levels[1:], strict=True)
+    return [(at, y) for at, before_after in zip(x, steps, strict=True) for y in before_after]
 
 
 def uneven() -> np.ndarray:
@@ -172,7 +175,7 @@ def office() -> np.ndarray:
     return np.vstack([outline(corridors + rooms + doors, columns), oblique])
 
 
-BUILDERS = {
+BUILDERS: dict[str, Callable[[], np.ndarray]] = {
     "fig04": object_ahead,
     "fig06a": corridor,
     "fig06b": opening,
@@ -234,7 +237,7 @@ SCAN_POSES = {
 """Poses [m, m, rad] from which some worlds are scanned."""
 
 
-def lookup(table: dict, name: str, what: str):
+def lookup(table: Mapping[str, T], name: str, what: str) -> T:
     """Entry `name` of a table.
 
     Args:
@@ -274,4 +277,4 @@ def scan_poses(name: str) -> np.ndarray:
     Raises:
         ValueError: There are none for a world of this name.
     """
-    return np.array(lookup(SCAN_POSES, name, "places"))
+    return np.array(lookup(SCAN_POSES, name, "list of scan poses"))

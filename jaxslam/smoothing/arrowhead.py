@@ -30,6 +30,7 @@ References:
     (1965), Maximum likelihood estimates of linear dynamic systems.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -46,13 +47,13 @@ State = tuple[Array, Array]
 class Jacobian(NamedTuple):
     """Jacobian J of the whitened residuals, block by block.
 
-    A step (dx, l) changes the residual of the motion to pose t by W (dx_t - F dx_t-1), and that of
-    feature m of scan t by `by_pose` dx_t + `by_place` l_at.
+    A step (dx, l) changes the residual of the odometry increment to pose t by
+    W (dx_t - F dx_t-1), and that of feature m of scan t by `J_pose` dx_t + `J_landmark` l_index.
 
     Attributes:
-        odometry_root: (T, 3, 3) W, square root of the information of the motion.
+        odometry_root: (T, 3, 3) W, square root of the information of the odometry increment.
         transition: (T, 3, 3) F. The first is not used, as the pose before it is known.
-        odometry_cov: (T, 3, 3) covariance of the motion, (W^T W)^-1.
+        odometry_cov: (T, 3, 3) covariance of the odometry increment, (W^T W)^-1.
         J_pose: (T, M, 2, 3) derivative of the features' residuals with respect to the pose; zero
             where masked.
         J_landmark: (T, M, 2, 2) derivative with respect to the landmark; zero where masked.
@@ -68,17 +69,17 @@ class Jacobian(NamedTuple):
 
 
 class _PoseTerms(NamedTuple):
-    """Terms of the cost of a step that hold a pose: motion and features, see `_eliminate`.
+    """Terms of the cost of a step that hold a pose: odometry and features, see `_eliminate`.
 
     Attributes:
         transition: (T, 3, 3) F.
-        spread: (T, 3, 3) Q.
+        odometry_cov: (T, 3, 3) Q.
         curvature: (T, 3, 3) K.
         coupling: (T, 3, 2 L + 1) C.
     """
 
     transition: Array
-    spread: Array
+    odometry_cov: Array
     curvature: Array
     coupling: Array
 
@@ -104,74 +105,76 @@ def matvec(matrix: Array, vector: Array) -> Array:
     return jnp.sum(matrix * vector[..., None, :], axis=-1)
 
 
-def apply_jacobian(rows: Jacobian, step: State) -> State:
-    """Change J step of the residuals of motions (T, 3) and of features (T, M, 2)."""
+def apply_jacobian(jacobian: Jacobian, step: State) -> State:
+    """Change J step of the residuals of odometry (T, 3) and of features (T, M, 2)."""
     poses, landmarks = step
     before = jnp.pad(poses[:-1], ((1, 0), (0, 0)))
-    motion = matvec(rows.odometry_root, poses - matvec(rows.transition, before))
-    return motion, matvec(rows.J_pose, poses[:, None]) + matvec(
-        rows.J_landmark, landmarks[rows.landmark_index]
-    )
+    odometry = matvec(jacobian.odometry_root, poses - matvec(jacobian.transition, before))
+    by_landmark = matvec(jacobian.J_landmark, landmarks[jacobian.landmark_index])
+    return odometry, matvec(jacobian.J_pose, poses[:, None]) + by_landmark
 
 
-def apply_transpose(rows: Jacobian, residuals: State, size: int) -> State:
+def apply_transpose(jacobian: Jacobian, residuals: State, *, num_landmarks: int) -> State:
     """The transpose of `apply_jacobian`: J^T residuals, (T, 3) and (L, 2).
 
     Args:
-        rows: J.
-        residuals: Of motions (T, 3) and of features (T, M, 2).
-        size: Number L of landmarks.
+        jacobian: J.
+        residuals: Of odometry (T, 3) and of features (T, M, 2).
+        num_landmarks: L.
     """
-    like = jnp.zeros_like(residuals[0]), jnp.zeros((size, 2), residuals[0].dtype)
-    return jax.linear_transpose(lambda step: apply_jacobian(rows, step), like)(residuals)[0]
+    like = jnp.zeros_like(residuals[0]), jnp.zeros((num_landmarks, 2), residuals[0].dtype)
+    return jax.linear_transpose(partial(apply_jacobian, jacobian), like)(residuals)[0]
 
 
-def landmark_blocks(rows: Jacobian, size: int) -> Array:
+def landmark_blocks(jacobian: Jacobian, *, num_landmarks: int) -> Array:
     """Landmarks' diagonal blocks (L, 2, 2) of J^T J: their information if the poses were known.
 
     Args:
-        rows: J.
-        size: Number L of landmarks.
+        jacobian: J.
+        num_landmarks: L.
     """
-    per_feature = rows.J_landmark.swapaxes(-1, -2) @ rows.J_landmark
-    return jnp.zeros((size, 2, 2), per_feature.dtype).at[rows.landmark_index].add(per_feature)
+    per_feature = jacobian.J_landmark.swapaxes(-1, -2) @ jacobian.J_landmark
+    blocks = jnp.zeros((num_landmarks, 2, 2), per_feature.dtype)
+    return blocks.at[jacobian.landmark_index].add(per_feature)
 
 
-def solve_arrowhead(rows: Jacobian, extra: Array, right: State) -> State:
-    """Solve (J^T J + extra) x = right.
+def solve_arrowhead(jacobian: Jacobian, prior_information: Array, right: State) -> State:
+    """Solve (J^T J + prior) x = right.
 
     The derivative is that of the solution, by another solve, not of the elimination.
 
     Args:
-        rows: J.
-        extra: (L, 2, 2) symmetric, prior information of the landmarks.
+        jacobian: J.
+        prior_information: (L, 2, 2) symmetric, of the landmarks.
         right: (T, 3) and (L, 2).
 
     Returns:
         x like `right`; NaN where the matrix is not positive definite.
     """
-    size = extra.shape[0]
+    size = prior_information.shape[0]
 
     def product(step: State) -> State:
-        poses, landmarks = apply_transpose(rows, apply_jacobian(rows, step), size)
-        return poses, landmarks + matvec(extra, step[1])
+        change = apply_jacobian(jacobian, step)
+        poses, landmarks = apply_transpose(jacobian, change, num_landmarks=size)
+        return poses, landmarks + matvec(prior_information, step[1])
 
     def solution(_: object, right: State) -> State:
-        return _eliminate(rows, landmark_blocks(rows, size) + extra, right)
+        blocks = landmark_blocks(jacobian, num_landmarks=size)
+        return _eliminate(jacobian, blocks + prior_information, right)
 
     return lax.custom_linear_solve(product, right, solution, symmetric=True)
 
 
-def _eliminate(rows: Jacobian, diagonal: Array, right: State) -> State:
-    """Solve as `solve_arrowhead` does, by a filter over the poses, conditioned on the landmarks' step.
+def _eliminate(jacobian: Jacobian, diagonal: Array, right: State) -> State:
+    """Solve as `solve_arrowhead` does, by a filter over the poses conditioned on the landmarks.
 
     The solution minimises a sum of quadratic terms. With v = (l, 1), all landmarks' steps and a
     one, so that what is linear is a column of what is bilinear, the terms that hold pose t are
 
         |dx_t - F dx_t-1|^2_Q / 2  +  dx_t^T K dx_t / 2  +  dx_t^T C v,      dx_0 = 0
 
-    of its motion, and of its features and the right side r_t: K = sum H_x^T H_x and
-    C = [sum H_x^T H_l, -r_t], for derivatives H_x = `by_pose` and H_l = `by_place`.
+    of its odometry increment, and of its features and the right side r_t: K = sum H_x^T H_x and
+    C = [sum H_x^T H_l, -r_t], for derivatives H_x = `J_pose` and H_l = `J_landmark`.
 
     Read exp(-cost) as a density, for any fixed v. Then these are the motion model and the
     measurements of a linear filter, whose means depend linearly on v: they are matrices times v.
@@ -192,28 +195,28 @@ def _eliminate(rows: Jacobian, diagonal: Array, right: State) -> State:
     v^T (B^T K B + B^T C + C^T B - D^T P' D) v / 2, where K B = D - C and P' D = B - B'.
 
     Args:
-        rows: J.
-        diagonal: (L, 2, 2) landmarks' blocks of the matrix, `extra` included.
+        jacobian: J.
+        diagonal: (L, 2, 2) landmarks' blocks of the matrix, the prior's included.
         right: (T, 3) and (L, 2).
     """
-    terms = _pose_terms(rows, diagonal.shape[0], right[0])
+    terms = _pose_terms(jacobian, diagonal.shape[0], right[0])
     filtered = _filter_poses(terms)
     landmarks = _solve_landmarks(terms, filtered, diagonal, right[1])
     return _smooth_poses(filtered, landmarks), landmarks.reshape(-1, 2)
 
 
-def _pose_terms(rows: Jacobian, size: int, right: Array) -> _PoseTerms:
+def _pose_terms(jacobian: Jacobian, size: int, right: Array) -> _PoseTerms:
     """The terms of each pose, for `size` landmarks and the poses' right side (T, 3)."""
-    steps = rows.landmark_index.shape[0]
-    by_pose = rows.J_pose.swapaxes(-1, -2)
-    coupling = jnp.zeros((steps, size, 3, 2), rows.J_landmark.dtype)
-    coupling = coupling.at[jnp.arange(steps)[:, None], rows.landmark_index].add(
-        by_pose @ rows.J_landmark
+    steps = jacobian.landmark_index.shape[0]
+    J_pose_T = jacobian.J_pose.swapaxes(-1, -2)
+    coupling = jnp.zeros((steps, size, 3, 2), jacobian.J_landmark.dtype)
+    coupling = coupling.at[jnp.arange(steps)[:, None], jacobian.landmark_index].add(
+        J_pose_T @ jacobian.J_landmark
     )
     coupling = coupling.swapaxes(1, 2).reshape(steps, 3, 2 * size)
     coupling = jnp.concatenate([coupling, -right[..., None]], axis=2)
-    curvature = jnp.sum(by_pose @ rows.J_pose, axis=1)
-    return _PoseTerms(rows.transition, rows.odometry_cov, curvature, coupling)
+    curvature = jnp.sum(J_pose_T @ jacobian.J_pose, axis=1)
+    return _PoseTerms(jacobian.transition, jacobian.odometry_cov, curvature, coupling)
 
 
 def _filter_poses(terms: _PoseTerms) -> _Filtered:
@@ -224,10 +227,12 @@ def _filter_poses(terms: _PoseTerms) -> _Filtered:
     eye = jnp.eye(3, dtype=terms.curvature.dtype)
     inflation = 1 + 2 * jnp.finfo(eye.dtype).eps * eye  # so that P stays positive under rounding
 
-    def forward(state: tuple[Array, Array], pose: _PoseTerms) -> tuple[tuple, _Filtered]:
+    def forward(
+        state: tuple[Array, Array], pose: _PoseTerms
+    ) -> tuple[tuple[Array, Array], _Filtered]:
         cov_before, mean_before = state
         transition = pose.transition
-        cov = (transition @ cov_before @ transition.T + pose.spread) * inflation
+        cov = (transition @ cov_before @ transition.T + pose.odometry_cov) * inflation
         predicted = transition @ mean_before
         # With P = L L^T: L^-1 P = L^T = R, and G = (L^-1 F P')^T L^-1.
         white = whiten(cov, jnp.concatenate([cov, transition @ cov_before, eye], axis=1))
@@ -253,10 +258,10 @@ def _solve_landmarks(
     index = jnp.arange(size)
     own = jnp.zeros((size, 2, size, 2), diagonal.dtype).at[index, :, index].set(diagonal)
     # One product for sum_t C^T B + D^T B'; the mean with its transpose removes rounding.
-    learnt = stack(terms.coupling, filtered.slope).T @ stack(filtered.predicted, filtered.updated)
-    learnt = (learnt + learnt.T)[:-1] / 2  # [S_ll, S_l1]
-    matrix = learnt[:, :-1] + own.reshape(2 * size, -1)
-    return _gauss_jordan(matrix, right.reshape(-1) - learnt[:, -1])
+    schur = stack(terms.coupling, filtered.slope).T @ stack(filtered.predicted, filtered.updated)
+    schur = (schur + schur.T)[:-1] / 2  # [S_ll, S_l1]
+    matrix = schur[:, :-1] + own.reshape(2 * size, -1)
+    return _gauss_jordan(matrix, right.reshape(-1) - schur[:, -1])
 
 
 def _smooth_poses(filtered: _Filtered, landmarks: Array) -> Array:
@@ -275,7 +280,8 @@ def _smooth_poses(filtered: _Filtered, landmarks: Array) -> Array:
 def _gauss_jordan(matrix: Array, right: Array) -> Array:
     """Solution (n,) for a positive definite matrix (n, n) and right side (n,).
 
-    Array operations only, no LAPACK, for the reason given in `linalg`; not unrolled, as n is large.
+    Array operations only, no LAPACK, for the reason given in `core.linalg`; not unrolled, as n is
+    large.
     """
 
     def eliminate_column(system: Array, k: Array) -> tuple[Array, None]:

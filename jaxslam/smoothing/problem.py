@@ -1,30 +1,32 @@
-"""The batch smoothing problem: measurements with covariances, residuals and their Jacobian."""
+"""The batch smoothing problem of one robot: the records, made of a filter's measurements.
 
-from functools import partial
-from typing import NamedTuple
+The unknowns are all poses and the positions of all landmarks; both smoothers, `dense` and `sparse`,
+minimise the squared Mahalanobis norm of the residuals of this problem (`residuals`).
+"""
+
+from functools import partial, reduce
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.core.features import restrict_features
-from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.se2 import relative, rotation, wrap_angle, wrap_direction
-from jaxslam.core.types import WALL, Array, check_array
+from jaxslam.core.types import AnyArray, Array, as_array, as_float, check_array
 from jaxslam.filtering import measurement_model
+from jaxslam.filtering.inputs import as_features, as_scan_match, check_params
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
-from jaxslam.smoothing.arrowhead import Jacobian, State, matvec
 
-ODOMETRY_STD_FLOOR = (
-    1e-4  # [m], [rad] std added to each odometry increment: that of a robot at rest is zero
-)
+ODOMETRY_STD_FLOOR = 1e-4
+"""[m], [rad] std added to each odometry increment: that of a robot at rest is zero."""
 
 
 class LandmarkPrior(NamedTuple):
     """Prior of the landmarks.
 
     Attributes:
-        positions: (L, 2) mean, as in `SmoothingResult`.
+        positions: (L, 2) mean, as `SmoothingResult.landmark_positions`.
         information: (L, 2, 2) inverse covariance; zero where nothing is known.
     """
 
@@ -36,13 +38,13 @@ class SmoothingProblem(NamedTuple):
     """The batch problem of one robot: odometry, landmark measurements, and their covariances.
 
     Attributes:
-        start: (3,) known pose before the first increment, world frame.
-        odometry: (T, 3) odometry increments, in the frame of the pose before.
+        start: (3,) [m, m, rad] known pose before the first increment, map frame.
+        odometry: (T, 3) [m, m, rad] odometry increments, in the frame of the pose before.
         odometry_cov: (T, 3, 3) their covariances in that frame, positive definite.
-        measurement: (T, M, 2) measured range [m] and bearing [rad], or direction [rad] of a wall and 0;
-            robot frame.
+        measurement: (T, M, 2) measured range [m] and bearing [rad], or direction [rad] of a wall
+            and 0; robot frame.
         measurement_cov: (T, M, 2, 2) their covariances.
-        kind: (T, M) int32 NODE, CORNER or WALL.
+        kind: (T, M) int32 `JUNCTION`, `CORNER` or `WALL`.
         landmark_index: (T, M) int32 landmark 0..L-1 of each feature; L, or -1, for none.
         prior: Of the landmarks; None for none.
     """
@@ -58,24 +60,24 @@ class SmoothingProblem(NamedTuple):
 
 
 class SmoothingResult(NamedTuple):
-    """Smoothed trajectory and landmarks.
+    """Smoothed trajectory and landmarks; JAX arrays of `smooth_trial`, NumPy of `smooth_log`.
 
     Attributes:
-        poses: (T, 3) world frame.
-        landmark_positions: (L, 2) [m] world frame, or direction [rad] of a wall and 0.
+        poses: (T, 3) [m, m, rad] map frame.
+        landmark_positions: (L, 2) [m] map frame, or direction [rad] of a wall and 0.
         cost: (iterations + 1,) squared Mahalanobis norm of all residuals, the guess's first.
     """
 
-    poses: Array
-    landmark_positions: Array
-    cost: Array
+    poses: AnyArray
+    landmark_positions: AnyArray
+    cost: AnyArray
 
 
 def build_problem(
     params: NoiseParams,
-    start: Array,
+    start: AnyArray,
     measurements: Measurement,
-    landmark_index: Array,
+    landmark_index: AnyArray,
     *,
     prior: LandmarkPrior | None = None,
     untrusted_inflation: float = 1.0,
@@ -84,151 +86,138 @@ def build_problem(
 
     Args:
         params: Noise parameters; `ODOMETRY_STD_FLOOR` is added to the odometry's.
-        start: (3,) known pose before the first increment, world frame.
-        measurements: [T] of the filter; `known` is not used.
-        landmark_index: (T, M) int32 landmark 0..L-1 of each feature; L, or -1, for none.
+        start: (3,) [m, m, rad] known pose before the first increment, map frame.
+        measurements: [T] of the filter; `landmark_ids` is not used.
+        landmark_index: (T, M) int landmark 0..L-1 of each feature; L, or -1, for none, as of
+            `number_landmarks`.
         prior: Of the landmarks.
-        untrusted_inflation: Factor on the standard deviation of untrusted features, as `Config.filter.untrusted_inflation`.
+        untrusted_inflation: Factor on the standard deviation of untrusted features, as
+            `FilterConfig.untrusted_inflation`; static.
 
     Raises:
-        ValueError: `landmark_index` has another shape or type than the features; while tracing.
+        ValueError: An argument has another shape or kind, or `untrusted_inflation` is not above
+            0.
     """
-    check_array("which", landmark_index, measurements.features.kind.shape, jnp.int32)
+    if not 0.0 < untrusted_inflation < np.inf:
+        raise ValueError(
+            f"untrusted_inflation is {untrusted_inflation}, not a finite number above 0"
+        )
+    start = as_float("start", start, (3,))
+    measurements = _as_measurements(measurements)
+    params = check_params(params, measurements.odometry.dtype)
+    landmark_index = as_index("landmark_index", landmark_index, measurements.features.kind.shape)
+    problem = _build_problem(
+        params, start, measurements, landmark_index, untrusted_inflation=float(untrusted_inflation)
+    )
+    return problem._replace(prior=None if prior is None else _as_prior("prior", prior, "L"))
+
+
+@partial(jax.jit, static_argnames="untrusted_inflation")
+def _build_problem(
+    params: NoiseParams,
+    start: Array,
+    measurements: Measurement,
+    landmark_index: Array,
+    *,
+    untrusted_inflation: float,
+) -> SmoothingProblem:
+    """`build_problem` of what has been checked, without a prior."""
     features = jax.vmap(restrict_features)(measurements.features, landmark_index >= 0)
-    motion, q = jax.vmap(motion_estimate, in_axes=(None, 0))(params, measurements)
+    odometry, odometry_cov = jax.vmap(motion_estimate, in_axes=(None, 0))(params, measurements)
+    floor = ODOMETRY_STD_FLOOR**2 * jnp.eye(3, dtype=odometry_cov.dtype)
+    of_features = partial(measurement_cov, params, untrusted_inflation=untrusted_inflation)
     return SmoothingProblem(
         start=start,
-        odometry=motion,
-        odometry_cov=q + (ODOMETRY_STD_FLOOR**2 * jnp.eye(3, dtype=q.dtype))[None],
+        odometry=odometry,
+        odometry_cov=odometry_cov + floor[None],
         measurement=jax.vmap(measurement_model.measure)(features),
-        measurement_cov=jax.vmap(
-            partial(measurement_cov, params, untrusted_inflation=untrusted_inflation)
-        )(features),
+        measurement_cov=jax.vmap(of_features)(features),
         kind=features.kind,
         landmark_index=jnp.where(features.valid, landmark_index, -1),
-        prior=prior,
     )
 
 
-def check_problem(problem: SmoothingProblem, poses: Array, landmark_positions: Array) -> None:
-    """Raise ValueError if shapes or types do not fit.
+def _as_prior(name: str, prior: LandmarkPrior, size: Any) -> LandmarkPrior:
+    """A prior of `size` landmarks in JAX arrays, checked."""
+    if not isinstance(prior, LandmarkPrior):
+        raise ValueError(f"{name} is a {type(prior).__name__}, not a LandmarkPrior")
+    positions = as_float(f"{name}.positions", prior.positions, (size, 2))
+    information = as_float(f"{name}.information", prior.information, (len(positions), 2, 2))
+    return LandmarkPrior(positions, information)
+
+
+def _as_measurements(given: Measurement) -> Measurement:
+    """Measurements [T] in JAX arrays of one precision, checked."""
+    if not isinstance(given, Measurement):
+        raise ValueError(f"measurements is a {type(given).__name__}, not a Measurement")
+    odometry = as_float("measurements.odometry", given.odometry, ("T", 3))
+    steps, dtype, matched = odometry.shape[:1], odometry.dtype, given.scan_match
+    features = as_features("measurements.features", given.features, steps, dtype)
+    if matched is not None:
+        matched = as_scan_match("measurements.scan_match", matched, steps, dtype)
+    return Measurement(odometry, features, scan_match=matched)
+
+
+def as_index(name: str, x: Any, shape: tuple[Any, ...]) -> Array:
+    """Indices or kinds as a JAX array of int32, checked.
 
     Args:
-        problem: The problem.
-        poses: (T, 3).
-        landmark_positions: (L, 2).
+        name: Name of `x`, for the message.
+        x: Whole numbers; JAX, NumPy or lists.
+        shape: As of `check_array`.
 
     Raises:
-        ValueError: An array has another shape or type; the message names it.
+        ValueError: They are of another shape, or no whole numbers.
     """
-    check_array("poses", poses, ("T", 3), jnp.floating)
-    check_array("places", landmark_positions, ("L", 2), jnp.floating)
-    check_array("records.which", problem.landmark_index, (len(poses), "M"), jnp.int32)
-    steps, scan, size = poses.shape[:1], problem.landmark_index.shape, landmark_positions.shape[:1]
-    sizes = dict(start=(3,), motion=steps + (3,), q=steps + (3, 3), seen=scan + (2,))
-    for name, shape in sizes.items():
-        check_array(f"records.{name}", getattr(problem, name), shape, jnp.floating)
-    check_array("records.r", problem.measurement_cov, scan + (2, 2), jnp.floating)
-    check_array("records.kind", problem.kind, scan, jnp.int32)
-    if problem.prior is not None:
-        check_array("records.prior.places", problem.prior.positions, size + (2,), jnp.floating)
-        check_array(
-            "records.prior.information", problem.prior.information, size + (2, 2), jnp.floating
-        )
+    x = as_array(name, x)
+    check_array(name, x, shape, jnp.integer)
+    return jnp.asarray(x, jnp.int32)
 
 
-def _root(cov: Array) -> Array:
-    """W (k, k) with W^T W = cov^-1."""
-    return inverse_cholesky(cov)[0]
-
-
-def whitened(problem: SmoothingProblem, size: int) -> SmoothingProblem:
-    """The problem with a prior, and with a root W of the information, W^T W = r^-1, instead of `r`.
-
-    W is zero, which masks the feature, where it has no landmark or its numbers are not finite or
-    not a covariance.
+def as_problem(
+    problem: SmoothingProblem, poses: AnyArray, landmark_positions: AnyArray
+) -> tuple[SmoothingProblem, Array, Array]:
+    """A problem and a guess in JAX arrays of one precision, the highest that is given; checked.
 
     Args:
         problem: The problem.
-        size: Number L of landmarks.
+        poses: (T, 3) guess.
+        landmark_positions: (L, 2) guess.
+
+    Raises:
+        ValueError: An array has another shape or kind; the message names it.
     """
-    seen, r, which = problem.measurement, problem.measurement_cov, problem.landmark_index
-    usable = (which >= 0) & (which < size) & jnp.all(jnp.isfinite(seen), axis=-1)
-    usable &= (r[..., 0, 0] > 0.0) & (r[..., 0, 0] * r[..., 1, 1] > r[..., 0, 1] ** 2)
-    usable &= jnp.all(jnp.isfinite(r), axis=(-2, -1))
-    safe = jnp.where(usable[..., None, None], r, jnp.eye(2, dtype=r.dtype))
-    no_prior = LandmarkPrior(jnp.zeros((size, 2), r.dtype), jnp.zeros((size, 2, 2), r.dtype))
-    return problem._replace(
-        measurement=jnp.where(usable[..., None], seen, 0.0),
-        measurement_cov=jnp.where(usable[..., None, None], jax.vmap(jax.vmap(_root))(safe), 0.0),
-        landmark_index=jnp.where(usable, which, 0),
-        prior=problem.prior or no_prior,
+    if not isinstance(problem, SmoothingProblem):
+        raise ValueError(f"problem is a {type(problem).__name__}, not a SmoothingProblem")
+    poses = as_float("poses", poses, ("T", 3))
+    positions = as_float("landmark_positions", landmark_positions, ("L", 2))
+    for name, x in (("poses", poses), ("landmark_positions", positions)):
+        if len(x) == 0:
+            raise ValueError(f"{name} is {x.dtype} {x.shape}: there is nothing to estimate")
+    steps, size = len(poses), len(positions)
+    index = as_index("problem.landmark_index", problem.landmark_index, (steps, "M"))
+    scan, prior = index.shape, problem.prior
+    if prior is not None:
+        prior = _as_prior("problem.prior", prior, size)
+    problem = SmoothingProblem(
+        start=as_float("problem.start", problem.start, (3,)),
+        odometry=as_float("problem.odometry", problem.odometry, (steps, 3)),
+        odometry_cov=as_float("problem.odometry_cov", problem.odometry_cov, (steps, 3, 3)),
+        measurement=as_float("problem.measurement", problem.measurement, (*scan, 2)),
+        measurement_cov=as_float("problem.measurement_cov", problem.measurement_cov, (*scan, 2, 2)),
+        kind=as_index("problem.kind", problem.kind, scan),
+        landmark_index=index,
+        prior=prior,
     )
+    return _in_one_precision((problem, poses, positions))
 
 
-def _residuals(records: SmoothingProblem, state: State) -> tuple[State, Jacobian]:
-    """Whitened residuals of motions (T, 3) and features (T, M, 2), and their Jacobian.
+def _in_one_precision(arrays: Any) -> Any:
+    """The same arrays, the real ones in the highest precision that any of them has."""
+    real = [x.dtype for x in jax.tree.leaves(arrays) if jnp.issubdtype(x.dtype, jnp.floating)]
+    highest = reduce(np.promote_types, real)
 
-    For poses x_t = (p_t, heading) and increments u_t, with R_t the rotation by the heading and
-    (x, y) = p_t - p_t-1, an error of the motion to pose t is, to first order,
+    def convert(x: Array) -> Array:
+        return x.astype(highest) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
-        d(x_t-1^-1 x_t) = R_t-1^T (dx_t - F dx_t-1)    F = [1 0 -y; 0 1 x; 0 0 1]
-    """
-    poses, landmarks = state
-    before = jnp.concatenate([records.start[None], poses[:-1]])
-    motion = jax.vmap(relative)(before, poses) - records.odometry
-    motion = motion.at[:, 2].set(wrap_angle(motion[:, 2]))
-    x, y = (poses - before).T[:2]
-    eye = jnp.zeros_like(records.odometry_cov) + jnp.eye(3, dtype=x.dtype)[None]
-    turn = eye.at[:, :2, :2].set(jax.vmap(rotation)(before[:, 2]))
-    root = jax.vmap(_root)(records.odometry_cov)
-    predict = jax.vmap(jax.vmap(measurement_model.predict_measurement, in_axes=(None, 0, 0)))
-    predicted, by_pose, by_landmark = predict(
-        poses, landmarks[records.landmark_index], records.kind
-    )
-    feature = -measurement_model.residual(records.measurement, predicted, records.kind)
-    rows = Jacobian(
-        odometry_root=root @ turn.swapaxes(1, 2),
-        transition=eye.at[:, :2, 2].set(jnp.stack([-y, x], axis=-1)),
-        odometry_cov=turn @ records.odometry_cov @ turn.swapaxes(1, 2),
-        J_pose=records.measurement_cov @ by_pose,
-        J_landmark=records.measurement_cov @ by_landmark,
-        landmark_index=records.landmark_index,
-    )
-    return (matvec(root, motion), matvec(records.measurement_cov, feature)), rows
-
-
-def _wrap_walls(records: SmoothingProblem, landmarks: Array) -> Array:
-    """Landmarks (L, 2), or differences of them, with the directions of observed walls wrapped."""
-    wall = jnp.any(records.measurement_cov != 0.0, axis=(-2, -1)) & (records.kind == WALL)
-    wall = jnp.zeros(landmarks.shape[0], bool).at[records.landmark_index].max(wall)
-    return landmarks.at[:, 0].set(jnp.where(wall, wrap_direction(landmarks[:, 0]), landmarks[:, 0]))
-
-
-def wrap_state(problem: SmoothingProblem, state: State) -> State:
-    """The state with headings in [-pi, pi) and directions of observed walls in [-pi/2, pi/2).
-
-    Args:
-        problem: As `whitened` returns them.
-        state: Poses (T, 3) and landmarks (L, 2).
-    """
-    poses, landmarks = state
-    return poses.at[:, 2].set(wrap_angle(poses[:, 2])), _wrap_walls(problem, landmarks)
-
-
-def evaluate(problem: SmoothingProblem, state: State) -> tuple[Array, State, Jacobian, Array]:
-    """Linearise the problem at a state.
-
-    Args:
-        problem: As `whitened` returns them.
-        state: Poses (T, 3) and landmarks (L, 2).
-
-    Returns:
-        Squared Mahalanobis norm () of all residuals and of the prior's; whitened residuals of
-        motions (T, 3) and features (T, M, 2); their Jacobian; half the gradient (L, 2) of the
-        prior's part.
-    """
-    residuals, rows = _residuals(problem, state)
-    error = _wrap_walls(problem, state[1] - problem.prior.positions)
-    pull = matvec(problem.prior.information, error)
-    return sum(jnp.sum(x**2) for x in residuals) + jnp.sum(error * pull), residuals, rows, pull
+    return jax.tree.map(convert, arrays)

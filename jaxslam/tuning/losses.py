@@ -1,10 +1,11 @@
-"""Losses for tuning Q and R by gradient: each is evaluated on one drive.
+"""Losses for tuning Q and R by gradient: each is evaluated on one episode.
 
-A loss takes the step infos [T] of the filter and its log, and returns a number (). `fitting.tune`
-takes any function that does so; these are the usual ones.
+A loss takes the step infos [T] of the filter and the episode that it ran on, and returns a number
+(). `fitting.tune` takes any function that does so; these are the usual ones. All are minimised.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -19,13 +20,14 @@ from jaxslam.filtering.slam_filter import StepInfo
 
 Loss = Callable[[StepInfo, Episode], Array]
 
-HEADING_WEIGHT = (
-    1.0  # [m^2 / rad^2] weight of a squared heading error, relative to a squared position
-)
+# [m^2 / rad^2] weight of a squared heading error, relative to a squared position error
+HEADING_WEIGHT = 1.0
 
 
 def pose_mse(info: StepInfo, episode: Episode) -> Array:
-    """Mean squared position error [m^2] plus `HEADING_WEIGHT` times squared heading error; needs truth.
+    """Mean squared error [m^2] of the position, plus `HEADING_WEIGHT` times that of the heading.
+
+    It needs truth.
 
     A common factor on all of Q and R leaves the filter's gains unchanged: this loss determines
     the ratios of the noise parameters, not their scale.
@@ -70,17 +72,33 @@ class WeightedLoss(NamedTuple):
     """A weighted sum of losses; itself a loss.
 
     Attributes:
-        terms: Weight and loss of each term.
+        terms: Weight and loss of each term; one at least.
     """
 
     terms: tuple[tuple[float, Loss], ...]
 
-    def __call__(self, info: StepInfo, log: Episode) -> Array:
+    def __call__(self, info: StepInfo, episode: Episode) -> Array:
         """The weighted sum ()."""
-        return sum(weight * loss(info, log) for weight, loss in self.terms)
+        first, *rest = [weight * loss(info, episode) for weight, loss in self.terms]
+        return sum(rest, start=first)
 
 
-BY_NAME = {f.__name__: f for f in (pose_mse, innovation_nll, pose_nll)}
+BY_NAME: Mapping[str, Loss] = MappingProxyType(
+    {"pose_nll": pose_nll, "pose_mse": pose_mse, "innovation_nll": innovation_nll}
+)
+"""The losses by name, as `jaxslam tune --loss` takes them."""
+
+
+def name_of(loss: Loss) -> str:
+    """Name of a loss of `BY_NAME`.
+
+    Raises:
+        ValueError: It is none of them.
+    """
+    for name, function in BY_NAME.items():
+        if function is loss:
+            return name
+    raise ValueError(f"{loss!r} is none of {', '.join(BY_NAME)}")
 
 
 def needs_truth(loss: Loss) -> bool:
@@ -90,31 +108,39 @@ def needs_truth(loss: Loss) -> bool:
     return loss in (pose_mse, pose_nll)
 
 
-def check_loss(loss: Loss, episodes: Episode, *, name: str = "logs") -> None:
-    """Check, before any work starts, that a loss can be evaluated on logs [B].
+def check_loss(loss: Loss, episodes: Episode, *, name: str = "episodes") -> None:
+    """Check, before any work starts, that a loss can be evaluated on episodes [B].
 
     Args:
         loss: The loss.
-        episodes: [B] drives.
-        name: What the logs are called in the error message.
+        episodes: [B] episodes, as `inputs.as_episodes` returns them.
+        name: What they are called in the error message.
 
     Raises:
-        ValueError: There are no logs, or one has no ground truth and the loss needs it.
+        ValueError: The loss is no function, or a sum without terms; there are no episodes, or
+            none with a step; or one has no ground truth and the loss needs it.
     """
-    if not episodes.odometry.shape[0]:
-        raise ValueError(f"{name}: no runs to tune on")
+    if not callable(loss):
+        named = f"losses.BY_NAME has {', '.join(BY_NAME)}"
+        raise ValueError(f"loss is {loss!r}, not a function of step infos and an episode; {named}")
+    if isinstance(loss, WeightedLoss) and not loss.terms:
+        raise ValueError("loss is a WeightedLoss without terms")
+    if not np.size(episodes.odometry):
+        raise ValueError(f"{name}: no episodes, or none with a step")
     if needs_truth(loss) and episodes.truth_mask is not None:
         missing = np.flatnonzero(~np.asarray(episodes.truth_mask).any(axis=1))
         if missing.size:
             raise ValueError(
-                f"{name}: run {missing[0]} has no reference, which this loss needs; "
-                "give one, or use the likelihood"
+                f"{name}: episode {missing[0]} has no reference, which this loss needs; give one, "
+                "or use losses.innovation_nll"
             )
 
 
-def _truth_mask(log: Episode) -> Array:
+def _truth_mask(episode: Episode) -> Array:
     """Scans (T,) bool with ground truth."""
-    return jnp.ones(len(log.truth), bool) if log.truth_mask is None else log.truth_mask
+    if episode.truth_mask is None:
+        return jnp.ones(len(episode.truth), bool)
+    return episode.truth_mask
 
 
 def _mean(values: Array, mask: Array) -> Array:

@@ -5,8 +5,8 @@ backtracking, which follows the narrow valleys between strongly correlated param
 minibatches losses are not comparable: Adam.
 
 The usual line search (`optax.lbfgs`) evaluates the loss several times per step inside `update`.
-Here every evaluation runs the filter on all data, by a program of its own, so `lbfgs_backtracking` does one
-evaluation per `update` and spreads the line search over several of them.
+Here every evaluation runs the filter on all data, by a program of its own, so `lbfgs_backtracking`
+does one evaluation per `update` and spreads the line search over several of them.
 """
 
 from functools import cache
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxslam.core.types import Array
+from jaxslam.tuning.inputs import check_count
 
 LBFGS_MEMORY = 10  # pairs of steps and gradient differences that L-BFGS stores
 MAX_CHANGE = 0.4  # largest change of a parameter in one step
@@ -41,9 +42,8 @@ class BacktrackState(NamedTuple):
     max_change: Array
 
 
-@cache
 def default_optimizer(num_updates: int, *, whole: bool) -> optax.GradientTransformationExtraArgs:
-    """The default optimiser.
+    """The default optimiser; the same object for the same arguments.
 
     Args:
         num_updates: Number of updates, over which Adam's learning rate decays to a tenth (cosine).
@@ -51,9 +51,19 @@ def default_optimizer(num_updates: int, *, whole: bool) -> optax.GradientTransfo
 
     Returns:
         `lbfgs_backtracking` if so, else Adam.
+
+    Raises:
+        ValueError: `num_updates` is no integer of 0 or more, or `whole` is neither True nor False.
     """
-    if whole:
-        return lbfgs_backtracking()
+    num_updates = check_count("num_updates", num_updates, 0)
+    if whole not in (True, False):
+        raise ValueError(f"whole is {whole!r}, not True or False")
+    return lbfgs_backtracking() if whole else _adam(num_updates)
+
+
+@cache
+def _adam(num_updates: int) -> optax.GradientTransformationExtraArgs:
+    """Adam, whose learning rate decays over `num_updates`."""
     rate = optax.cosine_decay_schedule(ADAM_RATE, max(num_updates, 1), alpha=0.1)
     return optax.with_extra_args_support(optax.adam(rate))
 
@@ -66,17 +76,18 @@ def lbfgs_backtracking() -> optax.GradientTransformationExtraArgs:
     value=f)`, which returns the step from x to the next trial point. The state is the best point
     x*, with its loss f*, a search direction d from it and a bound r on the change of any parameter:
 
-        start:  f* = inf, x* = x, d = 0, r = REACH
+        start:  f* = inf, x* = x, d = 0, r = MAX_CHANGE
 
         f < f*, accepted:                         f >= f* or NaN, rejected:
             x*, f* <- x, f                            x*, f*, d and L-BFGS stay as they are
             d <- L-BFGS direction from g              r <- min(r, max|d|) / 4
-            r <- min(2 r, REACH)                           (a quarter of the step that failed)
+            r <- min(2 r, MAX_CHANGE)                      (a quarter of the step that failed)
 
         in both cases the next trial point is  x* + d min(1, r / max|d|)
 
     A direction of L-BFGS that does not descend (g . d >= 0) is replaced by the negative gradient,
-    scaled to a largest change of REACH. The first evaluation is always accepted if it is finite.
+    scaled to a largest change of `MAX_CHANGE`. The first evaluation is always accepted if it is
+    finite.
     """
     lbfgs = optax.scale_by_lbfgs(memory_size=LBFGS_MEMORY)
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.tuning.inputs import check_type
 
 
 def unconstrain(params: NoiseParams) -> NoiseParams:
@@ -33,7 +34,12 @@ def unflatten_params(theta: Any, like: NoiseParams) -> NoiseParams:
 
 
 def param_names(params: NoiseParams) -> tuple[str, ...]:
-    """Names of the P parameters: `range`, or `odometry[2]` of several."""
+    """Names of the P parameters: `range_std`, or `odometry_coefficients[2]` of several.
+
+    Raises:
+        ValueError: It is no `NoiseParams`.
+    """
+    check_type("params", params, NoiseParams)
     return tuple(
         f"{field}[{i}]" if np.ndim(value) else field
         for field, value in params._asdict().items()
@@ -47,17 +53,19 @@ def trainable_mask(params: NoiseParams, frozen: Collection[str] = ()) -> np.ndar
 
     Args:
         params: The noise.
-        frozen: Names of parameters that are not tuned, or of fields: `odometry` is all four.
+        frozen: Names of parameters that are not tuned, or of fields: `odometry_coefficients` is
+            all four.
 
     Raises:
         ValueError: There is no such parameter, or none is left to tune.
     """
+    if isinstance(frozen, str):
+        raise ValueError(f"frozen is the string {frozen!r}, not a collection of names")
     known = param_names(params)
     unknown = set(frozen) - set(known) - set(params._fields)
     if unknown:
-        raise ValueError(
-            f"no parameter is called {sorted(unknown)[0]!r}; known: {', '.join(known)}"
-        )
+        name = sorted(unknown, key=str)[0]
+        raise ValueError(f"no parameter is called {name!r}; known: {', '.join(known)}")
     trainable = np.array([not {name, name.split("[")[0]} & set(frozen) for name in known])
     if not trainable.any():
         raise ValueError("all parameters are frozen: nothing is left to tune")

@@ -1,34 +1,63 @@
-"""Animation of a run: scans, estimated trajectory and landmarks of the filter, as GIF."""
+"""Animations as GIF: of any figure, and of a filter on a log with its scans and landmarks."""
 
-from pathlib import Path
+from collections.abc import Callable
+from os import PathLike
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.animation import PillowWriter
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import transform
+from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import init
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
 from jaxslam.pipeline.config import Config
+from jaxslam.viz import canvas, maps
 
-FRAMES = 100
+NUM_FRAMES = 100
+FRAMES_PER_SECOND = 12
+
+
+def write_gif(
+    path: str | PathLike, figure: Figure, draw: Callable[[int], None], num_frames: int
+) -> None:
+    """Write an animation of a figure as GIF.
+
+    Args:
+        path: File to write.
+        figure: The figure.
+        draw: Draws frame k on the figure; called for k = 0 .. `num_frames` - 1 in order.
+        num_frames: Number of frames.
+
+    Raises:
+        ValueError: `num_frames` is below 1.
+    """
+    if num_frames < 1:
+        raise ValueError(f"num_frames is {num_frames}, not at least 1")
+    writer = PillowWriter(fps=FRAMES_PER_SECOND)
+    with writer.saving(figure, str(path), dpi=int(figure.dpi)):
+        for frame in range(num_frames):
+            draw(frame)
+            writer.grab_frame()
 
 
 def animate_run(
-    path: Path,
+    path: str | PathLike,
     config: Config,
     params: NoiseParams,
     measurements: Measurement,
     scans: Scan,
-    estimate: np.ndarray,
-    odom_poses: np.ndarray,
+    estimate: AnyArray,
+    odom_poses: AnyArray,
     *,
-    frames: int = FRAMES,
+    num_frames: int = NUM_FRAMES,
 ) -> None:
     """Run the filter on a log again, and write an animation of it as GIF.
 
@@ -38,38 +67,43 @@ def animate_run(
         params: Noise parameters of the filter.
         measurements: [T] inputs of the filter.
         scans: [T] laser scans.
-        estimate: (T, 3) [m, m, rad] estimated trajectory of the whole run; it sets the limits of the
-            axes.
-        odom_poses: (T, 3) [m, m, rad] trajectory by odometry alone, world frame.
-        frames: Largest number of frames.
-    """
-    from jaxslam.viz import (
-        canvas,
-        gif,  # imported here, because matplotlib is slow to import
-        maps,
-    )
+        estimate: (T, 3) [m, m, rad] estimated trajectory of the whole log; it sets the limits of
+            the axes.
+        odom_poses: (T, 3) [m, m, rad] trajectory by odometry alone, map frame.
+        num_frames: Largest number of frames.
 
+    Raises:
+        ValueError: The arguments do not have the same T >= 1, or `num_frames` is below 1.
+    """
+    odom_poses = as_float64("odom_poses", odom_poses, ("T", 3))
     num_scans = len(odom_poses)
-    scans_per_frame = -(-num_scans // frames)
-    frames = -(-num_scans // scans_per_frame)
+    estimate = as_float64("estimate", estimate, (num_scans, 3))
+    if not num_scans or num_frames < 1:
+        raise ValueError(f"{num_scans} scans in {num_frames} frames: give at least 1 of each")
+    for name, record in (("measurements", measurements), ("scans", scans)):
+        lengths = {len(leaf) for leaf in jax.tree.leaves(record)}
+        if lengths != {num_scans}:
+            raise ValueError(f"{name} has {sorted(lengths)} steps, odom_poses has {num_scans}")
+    scans_per_frame = -(-num_scans // num_frames)
+    num_frames = -(-num_scans // scans_per_frame)
 
     def pad(values: jax.Array) -> jax.Array:
         """Fill the last frame by steps without features and motion: one program serves all."""
-        num_padding = frames * scans_per_frame - num_scans
+        num_padding = num_frames * scans_per_frame - num_scans
         return jnp.pad(values, [(0, num_padding)] + [(0, 0)] * (values.ndim - 1))
 
     measurements = jax.tree.map(pad, measurements)
-    points = np.asarray(jax.vmap(lidar.beam_ends, in_axes=(0, None))(scans, config.frontend.lidar))
+    ends = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
+    points = np.asarray(ends, np.float64)
     hit = np.asarray(scans.hit)
     returns = [points[scan][hit[scan]] for scan in range(num_scans)]
     belief = init(config.filter, jnp.asarray(odom_poses[0], float))
     poses = np.zeros((0, 3))
-    world_points = [
-        transform(pose, ends) for pose, ends in zip(estimate, returns, strict=True) if len(ends)
+    map_points = [
+        transform(pose, seen) for pose, seen in zip(estimate, returns, strict=True) if len(seen)
     ]
-    figure, axis = canvas.map_canvas(*canvas.extent(estimate, *world_points))
-    axis_style = {"xlim": axis.get_xlim(), "ylim": axis.get_ylim(), "aspect": "equal"}
-    axis_style |= {"xlabel": "x [m]", "ylabel": "y [m]"}
+    figure, axis = canvas.map_canvas(*canvas.extent(estimate, *map_points))
+    limits = axis.get_xlim(), axis.get_ylim()
 
     def draw(frame: int) -> None:
         nonlocal belief, poses
@@ -84,10 +118,11 @@ def animate_run(
         maps.draw_trajectory(axis, poses, "estimate")
         maps.draw_landmarks(axis, belief, confirm_count=config.filter.confirm_count)
         maps.draw_robot(axis, poses[-1], returns[done - 1])
-        axis.set(**axis_style, title=f"scan {done} of {num_scans}")
+        axis.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        axis.set_title(f"scan {done} of {num_scans}")
         if not figure.legends:
             canvas.legend(figure)
         bar.update()
 
-    with tqdm(total=frames, unit="frame", desc="animation") as bar:
-        gif.write_gif(path, figure, draw, frames)
+    with tqdm(total=num_frames, unit="frame", desc="animation") as bar:
+        write_gif(path, figure, draw, num_frames)

@@ -7,10 +7,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
-    *("#000000", "#E69F00", "#56B4E9", "#009E73"),
-    *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
-)
+from jaxslam.core.types import AnyArray, as_float64
+
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+YELLOW = "#F0E442"
+BLUE = "#0072B2"
+RED = "#D55E00"
+PINK = "#CC79A7"
 GREY = "#8C8C8C"
 NUM_SIGMAS = 3.0  # standard deviations that ellipses and bounds are drawn at
 
@@ -20,13 +26,24 @@ def canvas(
 ) -> tuple[Figure, np.ndarray]:
     """Figure of a size [inch] at 100 dots per inch, and its axes (rows, columns)."""
     figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
-    shared = "col" if rows > 1 else False
-    return figure, figure.subplots(rows, columns, squeeze=False, sharex=shared)
+    return figure, figure.subplots(
+        rows, columns, squeeze=False, sharex="col" if rows > 1 else False
+    )
 
 
-def map_canvas(low: np.ndarray, high: np.ndarray) -> tuple[Figure, Axes]:
-    """Figure 900 dots wide, of the rectangle from `low` (2,) to `high` (2,) [m, world frame]."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
+def map_canvas(low: AnyArray, high: AnyArray) -> tuple[Figure, Axes]:
+    """Figure 900 dots wide, with an axis for the map of a rectangle, in metres at one scale.
+
+    Args:
+        low: (2,) [m] lowest x, y, map frame; a margin is added.
+        high: (2,) [m] highest x, y.
+
+    Raises:
+        ValueError: `low` or `high` is not two finite numbers, or `high` is below `low`.
+    """
+    low, high = as_float64("low", low, (2,)), as_float64("high", high, (2,))
+    if not (np.isfinite([low, high]).all() and (low <= high).all()):
+        raise ValueError(f"low is {low.tolist()} and high {high.tolist()}, which is no rectangle")
     margin = 0.03 * np.max(high - low) + 0.2
     low, high = low - margin, high + margin
     width, height = high - low
@@ -37,11 +54,27 @@ def map_canvas(low: np.ndarray, high: np.ndarray) -> tuple[Figure, Axes]:
     return figure, axis
 
 
-def extent(*groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounding box, lowest and highest x, y (2,) [m], of points (N, 2) or poses (N, 3)."""
-    points = np.concatenate([np.asarray(group)[:, :2] for group in groups])
-    points = points[np.isfinite(points).all(axis=1)]
-    return points.min(axis=0), points.max(axis=0)
+def extent(*groups: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounding box of points or poses; those that are not finite are left out.
+
+    Args:
+        *groups: (N, 2) points [m] or (N, 3) poses [m, m, rad], each.
+
+    Returns:
+        Lowest and highest x, y, (2,) [m] each.
+
+    Raises:
+        ValueError: A group has another shape, or no point is finite.
+    """
+    points = [as_float64(f"groups[{k}]", group, ("N", "D")) for k, group in enumerate(groups)]
+    for k, group in enumerate(points):
+        if group.shape[1] not in (2, 3):
+            raise ValueError(f"groups[{k}] has the shape {group.shape}, not (N, 2) or (N, 3)")
+    every = np.concatenate([np.zeros((0, 2)), *(group[:, :2] for group in points)])
+    every = every[np.isfinite(every).all(axis=1)]
+    if not len(every):
+        raise ValueError("groups hold no finite point, and so have no extent")
+    return every.min(axis=0), every.max(axis=0)
 
 
 def legend(figure: Figure) -> None:

@@ -1,13 +1,18 @@
-"""Charts: pose errors over the scans of a run; losses and parameters over a tuning."""
+"""Charts: pose errors over the scans of a log; losses and parameters over a tuning."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, NUM_SIGMAS, ORANGE, PINK, RED, SKY
 
 
-def draw_errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = None) -> None:
+def draw_errors(
+    axes: Sequence[Axes] | np.ndarray, cov: AnyArray, error: AnyArray | None = None
+) -> None:
     """Draw the errors of heading, y and x with their 3-sigma bounds over the scans.
 
     Args:
@@ -15,9 +20,16 @@ def draw_errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = No
         cov: (T, 3, 3) pose covariance [m, m, rad].
         error: (T, 3) pose error [m, m, rad]; None: only the bounds are drawn.
 
+    Raises:
+        ValueError: An argument has another shape.
+
     References:
         Paper, Fig. 13.
     """
+    if len(axes) != 3:
+        raise ValueError(f"axes has {len(axes)} axes, not 3: heading, y and x")
+    cov = as_float64("cov", cov, ("T", 3, 3))
+    error = None if error is None else as_float64("error", error, (len(cov), 3))
     bound = NUM_SIGMAS * np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))  # (T, 3)
     scan = np.arange(len(bound))
     rows = (("heading [deg]", 2, 180 / np.pi), ("y [m]", 1, 1.0), ("x [m]", 0, 1.0))
@@ -35,15 +47,20 @@ def draw_errors(axes: np.ndarray, cov: np.ndarray, error: np.ndarray | None = No
     axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
 
 
-def draw_losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int) -> None:
+def draw_losses(axis: Axes, training: AnyArray, heldout: AnyArray, best: int) -> None:
     """Draw the losses of a tuning.
 
     Args:
         axis: Axis to draw on.
         training: (N,) training loss of each evaluation.
-        heldout: (N,) loss of the held-out runs; NaN where not evaluated.
+        heldout: (N,) loss of the held-out episodes; NaN where not evaluated.
         best: Index of the best evaluation.
+
+    Raises:
+        ValueError: An argument has another shape.
     """
+    training = as_float64("training", training, ("N",))
+    heldout = as_float64("heldout", heldout, (len(training),))
     evaluation = np.arange(len(training))
     axis.plot(evaluation, training, color=SKY, label="training")
     known = np.isfinite(heldout)
@@ -55,7 +72,7 @@ def draw_losses(axis: Axes, training: np.ndarray, heldout: np.ndarray, best: int
     axis.legend(frameon=False)
 
 
-def draw_parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, best: int) -> None:
+def draw_parameters(axis: Axes, names: Sequence[str], history: AnyArray, best: int) -> None:
     """Draw the parameters over the evaluations of a tuning, relative to their initial values.
 
     Args:
@@ -63,7 +80,11 @@ def draw_parameters(axis: Axes, names: tuple[str, ...], history: np.ndarray, bes
         names: (P,) names of the parameters.
         history: (N, P) parameters of each evaluation.
         best: Index of the best evaluation.
+
+    Raises:
+        ValueError: `history` has another shape.
     """
+    history = as_float64("history", history, ("N", len(names)))
     colours = (BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK, GREY)
     styles = ("-", "--", "-.", ":")
     for index, (name, values) in enumerate(zip(names, history.T, strict=True)):

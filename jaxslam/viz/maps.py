@@ -3,6 +3,9 @@
 Lines differ in style as well as in colour, and landmarks in shape.
 """
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
@@ -12,7 +15,7 @@ from matplotlib.transforms import Affine2D
 from jaxslam.core.features import Features
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.se2_np import transform
-from jaxslam.core.types import CORNER, JUNCTION
+from jaxslam.core.types import CORNER, JUNCTION, AnyArray, as_float64, check_array
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.covariance import slot_blocks
 from jaxslam.frontend.automaton import Diagram
@@ -24,7 +27,7 @@ from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, NUM_SIGMAS, ORANGE, PIN
 MAX_HITS = 40_000  # end points of beams drawn at most
 
 # Colour, line width, line style and zorder of each trajectory.
-TRAJECTORY_STYLES = {
+TRAJECTORY_STYLES: dict[str, tuple[str, float, Any, float]] = {
     "estimate": (SKY, 3.0, "-", 2.0),
     "truth": (BLACK, 1.2, (0, (4, 2)), 2.2),
     "reference": (BLACK, 1.2, (0, (4, 2)), 2.2),
@@ -36,11 +39,11 @@ LANDMARK_STYLES = {JUNCTION: ("o", GREEN, "junction"), CORNER: ("s", ORANGE, "co
 
 def draw_walls(axis: Axes, world: World) -> None:
     """Draw the walls of a world."""
-    lines = np.asarray(world.walls).reshape(-1, 2, 2)
-    axis.add_collection(LineCollection(lines, colors=GREY, linewidths=1.4, label="wall"))
+    lines = as_float64("world.walls", world.walls, ("N", 4)).reshape(-1, 2, 2)
+    axis.add_collection(LineCollection(list(lines), colors=GREY, linewidths=1.4, label="wall"))
 
 
-def draw_hits(axis: Axes, poses: np.ndarray, points: np.ndarray, hit: np.ndarray) -> None:
+def draw_hits(axis: Axes, poses: AnyArray, points: AnyArray, hit: AnyArray) -> None:
     """Draw the end points of the beams, at most `MAX_HITS` of them.
 
     Args:
@@ -48,31 +51,51 @@ def draw_hits(axis: Axes, poses: np.ndarray, points: np.ndarray, hit: np.ndarray
         poses: (T, 3) [m, m, rad] of the scans, world frame.
         points: (T, R, 2) end points of the beams [m, robot frame].
         hit: (T, R) bool, False where there is no return.
+
+    Raises:
+        ValueError: An argument has another shape or type.
     """
+    poses, hit = as_float64("poses", poses, ("T", 3)), np.asarray(hit)
+    check_array("hit", hit, (len(poses), "R"), jnp.bool_)
+    points = as_float64("points", points, (*hit.shape, 2))
     scan, beam = np.nonzero(hit)
     stride = 1 + len(scan) // MAX_HITS
     scan, beam = scan[::stride], beam[::stride]
-    x, y = transform(np.asarray(poses)[scan], points[scan, beam]).T
-    axis.plot(x, y, ",", color="#B5B5B5", zorder=0.5, label="_echoes", rasterized=True)
+    x, y = transform(poses[scan], points[scan, beam]).T
+    axis.plot(x, y, ",", color="#B5B5B5", zorder=0.5, label="_hits", rasterized=True)
 
 
-def draw_trajectory(axis: Axes, poses: np.ndarray, what: str) -> None:
+def draw_trajectory(axis: Axes, poses: AnyArray, what: str) -> None:
     """Draw a trajectory of the robot.
 
     Args:
         axis: Axis to draw on.
         poses: (T, 3) [m, m, rad], world frame.
         what: One of `TRAJECTORY_STYLES`; also its name in the legend.
+
+    Raises:
+        ValueError: `poses` has another shape, or `what` is unknown.
     """
+    if what not in TRAJECTORY_STYLES:
+        raise ValueError(f"what is {what!r}, not one of {', '.join(TRAJECTORY_STYLES)}")
     colour, width, style, zorder = TRAJECTORY_STYLES[what]
-    x, y = np.asarray(poses)[:, :2].T
+    x, y = as_float64("poses", poses, ("T", 3))[:, :2].T
     axis.plot(x, y, label=what, color=colour, linewidth=width, linestyle=style, zorder=zorder)
 
 
-def draw_robot(axis: Axes, pose: np.ndarray, ends: np.ndarray) -> None:
-    """Draw the robot at a pose (3,), and the end points (N, 2) of its beams [m, robot frame]."""
-    x, y, heading = pose = np.asarray(pose, float)
-    points = transform(pose, ends)
+def draw_robot(axis: Axes, pose: AnyArray, ends: AnyArray) -> None:
+    """Draw the robot and its scan.
+
+    Args:
+        axis: Axis to draw on.
+        pose: (3,) [m, m, rad], world frame.
+        ends: (N, 2) end points of the beams [m, robot frame].
+
+    Raises:
+        ValueError: An argument has another shape.
+    """
+    x, y, heading = pose = as_float64("pose", pose, (3,))
+    points = transform(pose, as_float64("ends", ends, ("N", 2)))
     axis.plot(
         points[:, 0], points[:, 1], ".", color=ORANGE, markersize=2.5, zorder=2.5, label="scan"
     )
@@ -80,15 +103,18 @@ def draw_robot(axis: Axes, pose: np.ndarray, ends: np.ndarray) -> None:
     axis.plot(x, y, marker=marker, color=BLUE, markersize=10, zorder=4, label="_robot")
 
 
-def draw_start_and_end(axis: Axes, poses: np.ndarray) -> None:
-    """Mark the start S and the finish F of a trajectory (T, 3)."""
+def draw_start_and_end(axis: Axes, poses: AnyArray) -> None:
+    """Mark the start S and the finish F of a trajectory (T, 3); raise ValueError if T is 0."""
+    poses = as_float64("poses", poses, ("T", 3))
+    if not len(poses):
+        raise ValueError("poses is empty: it has no start")
     box = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": BLACK}
     for name, pose in (("S", poses[0]), ("F", poses[-1])):
-        x, y = np.asarray(pose[:2], float)
+        x, y = pose[:2].tolist()
         axis.text(x, y, name, ha="center", va="center", fontsize=8, weight="bold", bbox=box)
 
 
-def draw_ellipses(axis: Axes, xy: np.ndarray, cov: np.ndarray, color: str) -> None:
+def draw_ellipses(axis: Axes, xy: AnyArray, cov: AnyArray, color: str) -> None:
     """Draw the 3-sigma ellipses of points.
 
     Args:
@@ -96,14 +122,26 @@ def draw_ellipses(axis: Axes, xy: np.ndarray, cov: np.ndarray, color: str) -> No
         xy: (N, 2) [m] centres.
         cov: (N, 2, 2) [m^2] covariances.
         color: Colour of the lines.
+
+    Raises:
+        ValueError: `xy` or `cov` has another shape.
     """
-    values, vectors = np.linalg.eigh(np.asarray(cov, float))  # ascending
+    xy = as_float64("xy", xy, ("N", 2))
+    values, vectors = np.linalg.eigh(as_float64("cov", cov, (len(xy), 2, 2)))  # ascending
     width, height = 2 * NUM_SIGMAS * np.sqrt(np.maximum(values.T[::-1], 0.0))
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    style = {"facecolors": "none", "edgecolors": color, "linewidths": 0.9, "zorder": 3}
     axis.add_collection(
         EllipseCollection(
-            width, height, angle, units="xy", offsets=xy, offset_transform=axis.transData, **style
+            width,
+            height,
+            angle,
+            units="xy",
+            offsets=xy,
+            offset_transform=axis.transData,
+            facecolors="none",
+            edgecolors=color,
+            linewidths=0.9,
+            zorder=3,
         )
     )
 
@@ -126,10 +164,26 @@ def draw_landmarks(axis: Axes, belief: Belief, *, confirm_count: int) -> None:
 def _draw_landmarks(axis: Axes, xy: np.ndarray, cov: np.ndarray, kind: int) -> None:
     """Draw landmarks (N, 2) of one kind with the ellipses of their covariances (N, 2, 2)."""
     marker, colour, name = LANDMARK_STYLES[kind]
-    style = {"color": colour, "markersize": 4, "markeredgecolor": "white", "markeredgewidth": 0.4}
-    label = f"{name}, {NUM_SIGMAS:g}-sigma ellipse"
-    axis.plot(xy[:, 0], xy[:, 1], marker, linestyle="none", label=label, zorder=3.5, **style)
+    _draw_markers(axis, xy, marker, colour, f"{name}, {NUM_SIGMAS:g}-sigma ellipse", 3.5)
     draw_ellipses(axis, xy, cov, colour)
+
+
+def _draw_markers(
+    axis: Axes, xy: np.ndarray, marker: str, colour: str, label: str, zorder: float
+) -> None:
+    """Draw points (N, 2) as small markers with a white edge."""
+    axis.plot(
+        xy[:, 0],
+        xy[:, 1],
+        marker,
+        linestyle="none",
+        label=label,
+        zorder=zorder,
+        color=colour,
+        markersize=4,
+        markeredgecolor="white",
+        markeredgewidth=0.4,
+    )
 
 
 def draw_arcs(axis: Axes, graph: TopologicalMap) -> None:
@@ -142,7 +196,11 @@ def draw_arcs(axis: Axes, graph: TopologicalMap) -> None:
 
 
 def draw_local_diagram(
-    axis: Axes, diagram: Diagram, sources: np.ndarray, spec: GridSpec, seen: Features | None = None
+    axis: Axes,
+    diagram: Diagram,
+    sources: AnyArray,
+    spec: GridSpec,
+    features: Features | None = None,
 ) -> None:
     """Draw the local Voronoi diagram of a scan in the robot frame: x up, y to the left.
 
@@ -151,51 +209,69 @@ def draw_local_diagram(
         diagram: (H, W) Voronoi regions.
         sources: (H, W) bool, occupied cells that the regions grew from.
         spec: Grid of the cells.
-        seen: Features of the scan.
+        features: Features of the scan.
+
+    Raises:
+        ValueError: The diagram or the sources do not have the cells of the grid.
     """
     labels, sources = np.asarray(diagram.labels), np.asarray(sources)
+    check_array("diagram.labels", labels, spec.shape)
+    check_array("sources", sources, spec.shape, jnp.bool_)
     palette = np.array([to_rgb(colour) for colour in (SKY, ORANGE, GREEN, PINK, YELLOW, BLUE, RED)])
     lowest_bit = np.log2(np.maximum(labels & -labels.astype(np.int64), 1)).astype(int)
     cell_colours = palette[lowest_bit % len(palette)]
     image = np.where((labels != 0)[..., None], 0.3 * cell_colours + 0.7, 1.0)
-    image[np.asarray(branch_cells(diagram, sources))] = to_rgb(BLACK)
+    image[np.asarray(branch_cells(diagram, jnp.asarray(sources)))] = to_rgb(BLACK)
     image[sources] = 0.75 * cell_colours[sources]
     extent = (-spec.y_half, spec.y_half, spec.x_min, spec.x_max)
     axis.imshow(image, origin="lower", extent=extent, interpolation="none")
     axis.plot(0, 0, "^", color=RED, markersize=8, clip_on=False)
-    if seen is not None:
-        xy, cov = np.asarray(seen.xy)[:, ::-1], np.asarray(seen.cov)[:, ::-1, ::-1]
+    if features is not None:
+        xy, cov = np.asarray(features.xy)[:, ::-1], np.asarray(features.cov)[:, ::-1, ::-1]
         for kind in LANDMARK_STYLES:
-            use = np.asarray(seen.valid & (seen.kind == kind))
+            use = np.asarray(features.valid & (features.kind == kind))
             _draw_landmarks(axis, xy[use], cov[use], kind)
     axis.set(xlim=(spec.y_half, -spec.y_half), ylim=(spec.x_min, spec.x_max), aspect="equal")
     axis.set(xlabel="y (left) [m]", ylabel="x (forward) [m]")
 
 
-def known_corners(map: OccupancyMap) -> np.ndarray:
-    """Corners (4, 2) [m, map frame] of the bounding box of the known cells of a grid."""
-    known = np.argwhere(map.occupied | map.free)
+def known_corners(grid: OccupancyMap) -> np.ndarray:
+    """Corners (4, 2) [m, map frame] of the bounding box of the known cells of a grid.
+
+    Raises:
+        ValueError: No cell is known.
+    """
+    known = np.argwhere(np.asarray(grid.occupied) | np.asarray(grid.free))
+    if not len(known):
+        raise ValueError("grid has no known cell, neither occupied nor free")
     low, high = known.min(axis=0), known.max(axis=0) + 1
-    return _cells_to_map(map).transform([low, (high[0], low[1]), high, (low[0], high[1])])
+    return _cells_to_map(grid).transform([low, (high[0], low[1]), high, (low[0], high[1])])
 
 
 def _cells_to_map(grid: OccupancyMap) -> Affine2D:
     """The transform from cell indices to the map frame."""
-    x, y, heading = np.asarray(grid.origin, float)
+    x, y, heading = as_float64("grid.origin", grid.origin, (3,)).tolist()
     return Affine2D().scale(grid.resolution).rotate(heading).translate(x, y)
 
 
-def draw_occupancy(axis: Axes, map: OccupancyMap) -> None:
-    """Draw an occupancy grid: occupied cells dark, unknown ones grey."""
-    image = np.where(map.free, 255, 205).astype(np.uint8)
-    image[map.occupied] = 60
+def draw_occupancy(axis: Axes, grid: OccupancyMap) -> None:
+    """Draw an occupancy grid: occupied cells dark, unknown ones grey.
+
+    Raises:
+        ValueError: The cells do not have one shape (H, W).
+    """
+    occupied, free = np.asarray(grid.occupied), np.asarray(grid.free)
+    check_array("grid.occupied", occupied, ("H", "W"), jnp.bool_)
+    check_array("grid.free", free, occupied.shape, jnp.bool_)
+    image = np.where(free, 255, 205).astype(np.uint8)
+    image[occupied] = 60
     limits = axis.get_xlim(), axis.get_ylim()
     axis.set_facecolor((205 / 255,) * 3)
     axis.imshow(
         image.T,
         origin="lower",
         extent=(0, image.shape[0], 0, image.shape[1]),
-        transform=_cells_to_map(map) + axis.transData,
+        transform=_cells_to_map(grid) + axis.transData,
         cmap="gray",
         vmin=0,
         vmax=255,
@@ -207,15 +283,14 @@ def draw_occupancy(axis: Axes, map: OccupancyMap) -> None:
 
 def draw_topological_map(axis: Axes, graph: TopologicalMap) -> None:
     """Draw the topological map of an occupancy grid; nodes and dead ends differ in marker."""
+    xy = as_float64("graph.xy", graph.xy, ("N", 2))
     axis.add_collection(
         LineCollection(graph.arc_lines, label="arc", colors=BLUE, linewidths=1.1, zorder=1.5)
     )
-    degree = np.bincount(graph.arc_ends.ravel(), minlength=len(graph.id))
+    degree = np.bincount(np.ravel(graph.arc_ends), minlength=len(xy))
     for name, marker, colour, use in (
         ("node", "o", RED, degree != 1),
         ("dead end", "s", ORANGE, degree == 1),
     ):
         if use.any():
-            style = {"color": colour, "markersize": 4, "markeredgecolor": "white"}
-            style |= {"markeredgewidth": 0.4, "linestyle": "none", "zorder": 2}
-            axis.plot(graph.xy[use, 0], graph.xy[use, 1], marker, label=name, **style)
+            _draw_markers(axis, xy[use], marker, colour, name, 2)

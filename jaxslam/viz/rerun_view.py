@@ -45,7 +45,7 @@ class RerunView:
 
         self._config, self._times, self._hit = config, times, np.asarray(scans.hit)
         self._points = np.asarray(
-            jax.vmap(lidar.beam_ends, in_axes=(0, None))(scans, config.frontend.lidar)
+            jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
         )
         self._poses = np.zeros((0, 3))
         self._stream = rerun.RecordingStream("jaxslam")
@@ -56,18 +56,18 @@ class RerunView:
         # The viewer draws y downwards in 2-D views, hence the 3-D coordinates.
         self._log("", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def watch(self, mapper: SlamState, part: ChunkResult) -> None:
+    def watch(self, state: SlamState, chunk: ChunkResult) -> None:
         """Show the scans of a chunk at their estimated poses, and the landmarks after the chunk.
 
         Args:
-            mapper: State of the filter after the chunk.
-            part: Results of the chunk.
+            state: State of SLAM after the chunk.
+            chunk: Results of the chunk.
         """
         from rerun import Arrows3D, Points3D
 
         from jaxslam.viz.canvas import BLUE, ORANGE
 
-        for pose in np.asarray(part.info.pose, np.float64):
+        for pose in np.asarray(chunk.info.pose, np.float64):
             scan = len(self._poses)
             self._poses = np.concatenate([self._poses, pose[None]])
             self._stream.set_time("scan", sequence=scan)
@@ -82,24 +82,25 @@ class RerunView:
             points = _to_3d(transform(pose, self._points[scan][self._hit[scan]]))
             self._log("scan", Points3D(points, colors=_rgb(ORANGE), radii=0.03))
         self._log_polylines("path", [self._poses[:, :2]], BLUE, 0.03)
-        self._log_landmarks(mapper.belief)
+        self._log_landmarks(state.belief)
 
-    def end(self, survey: SlamResult) -> None:
+    def end(self, result: SlamResult) -> None:
         """Show the final trajectory, landmarks and arcs of the topological map.
 
         Args:
-            survey: Result of SLAM.
+            result: Result of SLAM.
         """
         from jaxslam.viz.canvas import BLUE, GREEN
 
-        self._log_polylines("path", [survey.poses[:, :2]], BLUE, 0.03)
-        self._log_landmarks(survey.belief)
-        self._log_polylines("map/arcs", survey.topological_map.arc_lines, GREEN, 0.02)
+        self._log_polylines("path", [result.poses[:, :2]], BLUE, 0.03)
+        self._log_landmarks(result.belief)
+        self._log_polylines("map/arcs", result.topological_map.arc_lines, GREEN, 0.02)
         self._stream.disconnect()
 
     def _log_polylines(
         self, name: str, lines: Sequence[np.ndarray], colour: str, radius: float
     ) -> None:
+        """Log lines (N, 2) [m], `radius` [m] thick."""
         from rerun import LineStrips3D
 
         strips = [_to_3d(line) for line in lines]
@@ -132,6 +133,7 @@ class RerunView:
             self._log(f"map/{name}s/ellipses", strips)
 
     def _log(self, name: str, entity: Any, *, static: bool = False) -> None:
+        """Log an entity of rerun under `world`, at the current time or for all times."""
         self._stream.log(f"world/{name}".rstrip("/"), entity, static=static)
 
 

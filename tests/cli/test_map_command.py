@@ -15,7 +15,7 @@ from jaxslam.viz import canvas, maps
 FILES = {"metrics.json", "map.geojson", "map.graphml", "map.png"}
 YAML = "image: a.pgm\nresolution: 0.1\norigin: [-2.0, 1.0, 0.0]\nnegate: 0\n"
 YAML += "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
-MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "maps"
+MAPS = Path(__file__).resolve().parents[3] / "shared" / "data" / "maps"
 
 
 def write_map(folder, free=None):
@@ -63,11 +63,11 @@ def test_files_hold_one_graph_in_the_frame_of_the_map(done):
         for f in features
         if f["geometry"]["type"] == "Point"
     }
-    assert points == {id: [node["x"], node["y"]] for id, node in net.nodes(data=True)}
+    assert points == {key: [node["x"], node["y"]] for key, node in net.nodes(data=True)}
     roads = [f for f in features if f["geometry"]["type"] == "MultiLineString"]
     assert len(roads) == 2 * len(net.edges) == 4
     assert networkx.is_connected(net) and sorted(dict(net.degree).values()) == [1, 3]
-    (tip,) = (id for id, degree in net.degree if degree == 1)
+    (tip,) = (key for key, degree in net.degree if degree == 1)
     np.testing.assert_allclose(points[tip], [-2.0 + 8.0, 1.0 + 3.55], atol=0.3)
 
 
@@ -101,11 +101,11 @@ def test_graphml_keeps_parallel_arcs_loops_and_lines(tmp_path):
 
 def test_the_picture_shows_the_map_where_it_is():
     free = np.ones((20, 10), bool)
-    map = OccupancyMap(~free, free, 0.5, np.array([1.0, 2.0, np.pi / 2]))
-    corners = maps.known_corners(map)
+    grid = OccupancyMap(~free, free, 0.5, np.array([1.0, 2.0, np.pi / 2]))
+    corners = maps.known_corners(grid)
     np.testing.assert_allclose(corners, [[1, 2], [1, 12], [-4, 12], [-4, 2]], atol=1e-12)
     axis = canvas.map_canvas(*canvas.extent(corners))[1]
-    maps.draw_occupancy(axis, map)
+    maps.draw_occupancy(axis, grid)
     maps.draw_topological_map(axis, graph_of_two())
     (image,) = axis.images
     shown = image.get_transform() - axis.transData
@@ -140,11 +140,11 @@ def test_map_refuses_what_is_no_map(refused, tmp_path):
 
 
 def test_map_refuses_a_map_without_free_space(refused, tmp_path):
-    assert "a.yaml: has no free space" in refused(write_map(tmp_path, np.zeros((9, 9), bool)))
-    assert "5 m" in refused(write_map(tmp_path), "--clearance", 5.0)
+    assert "a.yaml: no free space" in refused(write_map(tmp_path, np.zeros((9, 9), bool)))
+    assert "5 m" in refused(write_map(tmp_path), "--robot-radius", 5.0)
 
 
-@pytest.mark.parametrize("option", ["--clearance", "--speck"])
+@pytest.mark.parametrize("option", ["--robot-radius", "--min-obstacle-size"])
 @pytest.mark.parametrize("value", [-1, "nan", "inf"])
 def test_map_refuses_bad_options(refused, tmp_path, option, value):
     assert option in refused(write_map(tmp_path), option, value)

@@ -1,4 +1,3 @@
-import math
 import re
 
 import jax
@@ -6,146 +5,63 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.se2 import compose, transform
-from jaxslam.frontend.lidar import beam_angles, beam_ends, in_free_view, to_scan
-from jaxslam.simulation import worlds
-from jaxslam.simulation.ray_casting import add_range_noise, cast
-from jaxslam.simulation.worlds import World
+from jaxslam.core.scan import Lidar, Scan, as_scan, check_lidar
 
-ROUND = Lidar(num_beams=360, angle_min=-math.pi, angle_increment=math.pi / 180)
-ROOM = (-2.0, -1.0, 3.0, 2.0)
-
-
-def room_ranges(pose, lidar):
-    """Distances (R,) [m] to the sides of ROOM: each axis is left through the side ahead."""
-    angle = pose[2] + np.asarray(beam_angles(lidar))
-    with np.errstate(divide="ignore"):
-        x = np.where(np.cos(angle) > 0, ROOM[2] - pose[0], ROOM[0] - pose[0]) / np.cos(angle)
-        y = np.where(np.sin(angle) > 0, ROOM[3] - pose[1], ROOM[1] - pose[1]) / np.sin(angle)
-    return np.minimum(np.abs(x), np.abs(y))
-
-
-@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (1.3, -0.4, 0.7), (-1.9, 1.9, -3.0)])
-def test_cast_in_a_room_is_the_distance_to_its_sides(pose):
-    scan = cast(ROUND, World(worlds.outline([ROOM])), jnp.array(pose))
-    np.testing.assert_allclose(scan.ranges, room_ranges(pose, ROUND), atol=1e-9)
-    assert scan.hit.all()
-
-
-def test_ends_of_the_beams_lie_on_the_walls():
-    pose = jnp.array([1.3, -0.4, 0.7])
-    ends = transform(pose, beam_ends(ROUND, cast(ROUND, World(worlds.outline([ROOM])), pose)))
-    side = np.abs(np.asarray(ends)[:, [0, 1, 0, 1]] - np.array(ROOM)).min(axis=1)
-    np.testing.assert_allclose(side, 0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_turning_world_and_robot_together_changes_nothing(seed):
-    office, pose = worlds.named("office"), jnp.array([1.013, 0.917, 0.31])
-    turn = jax.random.uniform(jax.random.key(seed), (3,), minval=-3, maxval=3)
-    walls = transform(turn, jnp.asarray(office.walls).reshape(-1, 2, 2)).reshape(-1, 4)
-    here, there = cast(Lidar(), office, pose), cast(Lidar(), World(walls), compose(turn, pose))
-    np.testing.assert_allclose(there.ranges, here.ranges, atol=1e-9)
-    np.testing.assert_array_equal(there.hit, here.hit)
-
-
-def test_no_beam_slips_through_a_corner():
-    square = jnp.asarray(worlds.outline([(-1.0, -1.0, 1.0, 1.0)])).reshape(-1, 2, 2)
-    fan = Lidar(
-        num_beams=8, angle_min=-math.pi, angle_increment=math.pi / 4
-    )  # every other beam meets a corner
-    turns = jax.random.uniform(jax.random.key(0), (2000, 3), minval=-3, maxval=3)
-
-    @jax.jit
-    @jax.vmap
-    def ranges(turn):
-        return cast(fan, World(transform(turn, square).reshape(-1, 4)), turn).ranges
-
-    expected = np.tile([1, math.sqrt(2)] * 4, (2000, 1))
-    np.testing.assert_allclose(ranges(turns), expected, atol=1e-4)
-
-
-def test_nothing_returns_from_beyond_the_reach():
-    scan = cast(ROUND._replace(range_max=1.5), World(worlds.outline([ROOM])), jnp.zeros(3))
-    near = room_ranges((0, 0, 0), ROUND) < 1.5
-    np.testing.assert_array_equal(scan.hit, near)
-    assert np.all(np.asarray(scan.ranges)[~near] == 1.5)
-
-
-def test_bad_readings_become_no_return():
-    lidar = Lidar(num_beams=8, range_max=5.0)
-    scan = to_scan(lidar, jnp.array([1.0, jnp.nan, jnp.inf, -jnp.inf, 0.0, -1.0, 5.0, 7.0]))
-    np.testing.assert_array_equal(scan.hit, [True] + 7 * [False])
-    np.testing.assert_array_equal(scan.ranges, [1.0] + 7 * [5.0])
-
-
-def test_noise_has_the_spread_it_says_and_spares_what_was_not_hit():
-    n = 20_000
-    lidar = Lidar(num_beams=n, range_std=0.03)
-    scan = Scan(ranges=jnp.full(n, 2.0).at[:100].set(10.0), hit=jnp.arange(n) >= 100)
-    noisy = add_range_noise(jax.random.key(0), lidar, scan)
-    error = np.asarray(noisy.ranges - scan.ranges)[100:]
-    assert abs(error.mean()) < 4 * 0.03 / np.sqrt(error.size)
-    assert abs(error.std() - 0.03) < 4 * 0.03 / np.sqrt(2 * error.size)
-    np.testing.assert_array_equal(noisy.hit, scan.hit)
-    np.testing.assert_array_equal(noisy.ranges[:100], 10.0)
-
-
-def test_readings_pushed_beyond_the_reach_are_lost():
-    n = 4000
-    lidar = Lidar(num_beams=n, range_std=0.03)
-    scan = Scan(ranges=jnp.full(n, lidar.range_max - 1e-9), hit=jnp.ones(n, bool))
-    lost = 1 - np.asarray(add_range_noise(jax.random.key(1), lidar, scan).hit).mean()
-    assert abs(lost - 0.5) < 4 * 0.5 / np.sqrt(n)
-
-
-def test_scans_are_batched_and_differentiable():
-    office = worlds.named("office")
-    starts = jnp.array([[1.01, 0.9, 0.1], [3.5, 3.6, 1.2]])
-    ranges = jax.jit(lambda pose: cast(Lidar(), office, pose).ranges)
-    alone = jnp.stack([ranges(pose) for pose in starts])
-    np.testing.assert_allclose(jax.jit(jax.vmap(ranges))(starts), alone, atol=1e-12)
-    slope = jax.jit(jax.jacfwd(ranges))(starts[0])
-    assert jnp.isfinite(slope).all()
-
-
-def flat(*shape, dtype=float):
-    return jnp.zeros(shape, dtype)
+SMALL = Lidar(num_beams=3)
 
 
 @pytest.mark.parametrize(
-    "call, told",
+    "lidar, message",
     [
-        (lambda: cast(ROUND, World(flat(5, 3)), flat(3)), "world.walls is float64 (5, 3)"),
-        (lambda: cast(ROUND, World(flat(5, 4)), flat(2, 3)), "pose is float64 (2, 3), not"),
-        (lambda: to_scan(ROUND, flat(361)), "ranges is float64 (361,), not floating (..., 360)"),
-        (lambda: to_scan(ROUND, flat(360, dtype=int)), "ranges is int64 (360,), not floating"),
-        (
-            lambda: beam_ends(ROUND, Scan(flat(2, 360), flat(2, 360))),
-            "scan.ranges is float64 (2, 360)",
-        ),
+        (SMALL._replace(num_beams=1), "lidar.num_beams is 1, not an integer of at least 2"),
+        (SMALL._replace(num_beams=2.5), "lidar.num_beams is 2.5, not an integer of at least 2"),
+        (SMALL._replace(angle_increment=0.0), "lidar.angle_increment is 0.0, not above 0"),
+        (SMALL._replace(angle_increment=-0.1), "lidar.angle_increment is -0.1, not above 0"),
+        (SMALL._replace(range_max=0.0), "lidar.range_max is 0.0, not above 0"),
+        (SMALL._replace(range_max=np.inf), "lidar.range_max is inf, not a finite number"),
+        (SMALL._replace(angle_min=np.nan), "lidar.angle_min is nan, not a finite number"),
+        (SMALL._replace(range_std=-0.1), "lidar.range_std is -0.1, which is below 0"),
+        (SMALL._replace(range_max="10"), "lidar.range_max is <U2 (), not numbers"),
+        (None, "lidar is a NoneType, not a Lidar"),
     ],
 )
-def test_wrong_shapes_and_types_are_told_while_tracing(call, told):
-    with pytest.raises(ValueError, match=re.escape(told)):
-        jax.eval_shape(call)
+def test_an_impossible_scanner_is_refused(lidar, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_lidar(lidar)
 
 
-def test_raw_ranges_of_many_scans_are_limited_together():
-    ranges = jnp.array([[1.0, 20.0], [jnp.nan, 2.0]])
-    scans = to_scan(Lidar(num_beams=2), ranges)
-    np.testing.assert_array_equal(scans.hit, [[True, False], [False, True]])
+def test_possible_scanners_pass():
+    for lidar in (
+        Lidar(),
+        SMALL,
+        SMALL._replace(range_std=0),
+        SMALL._replace(num_beams=np.int64(7)),
+    ):
+        check_lidar(lidar)
 
 
-def test_places_lie_before_the_ends_of_both_beams_beside_them():
-    quarter = Lidar(num_beams=3, angle_min=0.0, angle_increment=0.25 * np.pi)
-    ranges = jnp.array([2.0, 2.0, 1.0])
-    angle = jnp.array([0.1, 0.1, 0.9, 0.9, -0.6, 2.2])  # between beams 0 and 1, 1 and 2, outside
-    away = jnp.array([1.9, 2.1, 0.9, 1.1, 0.5, 0.5])
-    places = away[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    want = [True, False, True, False, False, False]
-    np.testing.assert_array_equal(in_free_view(quarter, places, ranges), want)
-    np.testing.assert_array_equal(
-        in_free_view(quarter, places.reshape(2, 3, 2), ranges), np.reshape(want, (2, 3))
-    )
+def _single(x):
+    x = np.asarray(x)
+    return x if x.dtype == bool else x.astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", [list, np.asarray, _single, jnp.asarray])
+def test_scans_of_lists_and_arrays_are_the_same(kind):
+    scan = as_scan(SMALL, Scan(kind([1.0, 10.0, 2.5]), kind([True, False, True])))
+    assert isinstance(scan.ranges, jax.Array) and isinstance(scan.hit, jax.Array)
+    assert scan.ranges.dtype == jnp.float64 and scan.hit.dtype == bool
+    assert scan.ranges.tolist() == [1.0, 10.0, 2.5] and scan.hit.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    "scan, message",
+    [
+        (np.zeros(3), "scan is a ndarray, not a Scan"),
+        (Scan(np.zeros(4), np.ones(4, bool)), "scan.ranges is float64 (4,), not floating (3,)"),
+        (Scan(np.zeros(3), np.ones(4, bool)), "scan.hit is bool (4,), not bool (3,)"),
+        (Scan(np.zeros(3), np.ones(3)), "scan.hit is float64 (3,), not bool (3,)"),
+    ],
+)
+def test_scans_of_another_scanner_are_refused(scan, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        as_scan(SMALL, scan)

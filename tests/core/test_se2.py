@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core import se2
+from jaxslam.core import se2, se2_np
 
 SEEDS = range(5)
 
@@ -37,14 +37,14 @@ def test_compose_is_a_group(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_between_undoes_compose(seed):
+def test_relative_is_the_inverse_of_compose(seed):
     a, b, _ = poses(seed)
     np.testing.assert_allclose(se2.compose(a, se2.relative(a, b)), b, atol=1e-12)
     np.testing.assert_allclose(se2.relative(a, se2.compose(a, b)), b, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_to_robot_undoes_to_world(seed):
+def test_inverse_transform_is_the_inverse_of_transform(seed):
     pose = poses(seed)[0]
     points = jax.random.normal(jax.random.key(seed + 100), (4, 7, 2))
     there = se2.transform(pose, points)
@@ -62,7 +62,7 @@ def test_wrap_angle_keeps_the_direction_and_the_slope():
     np.testing.assert_allclose(jax.vmap(jax.grad(se2.wrap_angle))(angles), 1.0)
 
 
-def test_wrap_line_keeps_the_line():
+def test_wrap_direction_keeps_the_line():
     angles = jnp.linspace(-20, 20, 401)
     wrapped = se2.wrap_direction(angles)
     assert np.all((wrapped >= -np.pi / 2) & (wrapped < np.pi / 2))
@@ -101,3 +101,50 @@ def test_cross_and_dot_are_sine_and_cosine():
 
 def test_wrapped_zero_keeps_float32():
     assert se2.compose(jnp.zeros(3, jnp.float32), jnp.ones(3, jnp.float32)).dtype == jnp.float32
+
+
+def test_dead_reckoning_composes_increments():
+    start, steps = poses(0)[0], poses(1)
+    found = se2.dead_reckoning(start, steps)
+    pose = start
+    for t in range(3):
+        pose = se2.compose(pose, steps[t])
+        np.testing.assert_allclose(found[t], pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("module", [se2, se2_np])
+def test_increments_are_the_inverse_of_dead_reckoning(module):
+    path = np.concatenate([np.asarray(poses(seed)) for seed in SEEDS])
+    path = path if module is se2_np else jnp.asarray(path)
+    steps = module.increments(path)
+    assert steps.shape == path.shape and not steps[0].any()
+    np.testing.assert_allclose(module.dead_reckoning(path[0], steps), path, atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_numpy_and_jax_agree(seed):
+    a, b, c = poses(seed)
+    points = jax.random.normal(jax.random.key(seed), (4, 7, 2))
+    for name, args in (
+        ("wrap_angle", (jnp.linspace(-20, 20, 401),)),
+        ("compose", (a, b)),
+        ("relative", (a, b)),
+        ("transform", (a, points)),
+        ("inverse_transform", (a, points)),
+        ("dead_reckoning", (a, jnp.stack([b, c]))),
+        ("increments", (jnp.stack([a, b, c]),)),
+    ):
+        expected = getattr(se2, name)(*args)
+        found = getattr(se2_np, name)(*map(np.asarray, args))
+        assert isinstance(found, np.ndarray) and found.dtype == np.float64
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_numpy_takes_many_poses_at_once():
+    a, b = np.asarray(poses(0)), np.asarray(poses(1))
+    for name in ("compose", "relative"):
+        expected = jax.vmap(getattr(se2, name))(a, b)
+        np.testing.assert_allclose(getattr(se2_np, name)(a, b), expected, atol=1e-12)
+    for name in ("transform", "inverse_transform"):
+        expected = jax.vmap(getattr(se2, name))(a, b[:, :2])
+        np.testing.assert_allclose(getattr(se2_np, name)(a, b[:, :2]), expected, atol=1e-12)

@@ -1,4 +1,4 @@
-"""The experiment of many drives: on several processes, and stopped and gone on with."""
+"""The experiment of many drives: on several processes, stopped and resumed."""
 
 import json
 import multiprocessing
@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import estimator, monte_carlo, processes, scaling
+from experiments import filter_benchmark, monte_carlo, processes, scaling
 from jaxslam.core.scan import Lidar
 from jaxslam.core.types import CORNER, WALL
 from jaxslam.filtering.config import FilterConfig
@@ -32,14 +32,8 @@ from jaxslam.simulation.robot import Robot
 
 CONFIG = Config.for_lidar(
     Lidar(num_beams=91, angle_increment=np.pi / 90),
-    frontend=FrontendConfig(
-        grid=GridSpec(x_max=4.0, y_half=3.0),
-    ),
-    filter=FilterConfig(
-        max_landmarks=16,
-        max_updates=4,
-        landmark_kinds=(CORNER, WALL),
-    ),
+    frontend=FrontendConfig(grid=GridSpec(x_max=4.0, y_half=3.0)),
+    filter=FilterConfig(max_landmarks=16, max_updates=4, landmark_kinds=(CORNER, WALL)),
 )
 CASE = monte_carlo.Case(
     seed=5,
@@ -47,14 +41,14 @@ CASE = monte_carlo.Case(
     robot=Robot(),
     walls=np.asarray(worlds.named("fig07").walls),
     path=densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
-    steps=4,
+    num_scans=4,
 )
-RUNS = 10
+NUM_TRIALS = 10
 TIMED = {"seconds", "seconds_per_scan", "peak_mb", "processes", "devices"}
 
 
-def told(numbers):
-    """What does not depend on where and when it was found."""
+def untimed(numbers):
+    """The numbers that do not depend on where and when they were computed."""
     return json.loads(json.dumps(plain(numbers) | dict.fromkeys(TIMED)))
 
 
@@ -62,18 +56,18 @@ def told(numbers):
 def done(tmp_path_factory):
     """The numbers of one process, and the folder where it has kept its runs."""
     folder = tmp_path_factory.mktemp("one") / "runs"
-    return monte_carlo.work(CASE, RUNS, folder, StringIO()), folder
+    return monte_carlo.work(CASE, NUM_TRIALS, folder, StringIO()), folder
 
 
-def hello(text, say):
+def hello(text, stream):
     """Work that needs no compiler."""
     import jax
 
-    say.write(f"this is process {jax.process_index()}\n")
+    stream.write(f"this is process {jax.process_index()}\n")
     return f"{text} {jax.process_index()} of {jax.process_count()}"
 
 
-def die(who, how, say):
+def die(who, how, stream):
     """Work at which process `who` ends early, and the others wait for it."""
     import jax
     from jax.experimental import multihost_utils
@@ -98,18 +92,18 @@ def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypa
     monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
     flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
     monkeypatch.setenv("XLA_FLAGS", flags)
-    numbers = monte_carlo.compute(CASE, RUNS, tmp_path / "runs", processes.local(2))
+    numbers = monte_carlo.compute(CASE, NUM_TRIALS, tmp_path / "runs", processes.local(2))
     assert numbers["processes"] == numbers["devices"] == 2
-    assert told(numbers) == told(done[0])
+    assert untimed(numbers) == untimed(done[0])
     (one,), (two,) = ([*folder.glob("*.npz")] for folder in (done[1], tmp_path / "runs"))
     with np.load(one) as one, np.load(two) as two:
-        for name in monte_carlo.Track._fields:
+        for name in TrialResult._fields:
             np.testing.assert_array_equal(one[name], two[name])
 
 
 @pytest.mark.timeout(120)
 def test_each_process_returns_what_it_found(capfd):
-    assert processes.run(processes.local(2), hello, "I am") == ["I am 0 of 2", "I am 1 of 2"]
+    assert processes.run_group(processes.local(2), hello, "I am") == ["I am 0 of 2", "I am 1 of 2"]
     assert capfd.readouterr().err == "this is process 0\n"
 
 
@@ -117,9 +111,14 @@ def test_each_process_returns_what_it_found(capfd):
 @pytest.mark.parametrize(
     "who, how, kind, line",
     [
-        (1, "kill", processes.Lost, "process 1 of 2 ended early (exit code -9)"),
-        (0, "kill", processes.Lost, "process 0 of 2 ended early (exit code -9)"),
-        (1, "raise", processes.Lost, "process 1 of 2 ended early (ValueError: nothing to)"),
+        (1, "kill", processes.LostProcessError, "process 1 of 2 ended early (exit code -9)"),
+        (0, "kill", processes.LostProcessError, "process 0 of 2 ended early (exit code -9)"),
+        (
+            1,
+            "raise",
+            processes.LostProcessError,
+            "process 1 of 2 ended early (ValueError: nothing to)",
+        ),
         (0, "refuse", InputError, "--this: is bad"),
     ],
 )
@@ -127,19 +126,19 @@ def test_a_process_that_ends_early_ends_all(who, how, kind, line, tmp_path, monk
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     begin = monotonic()
     with pytest.raises(kind, match=re.escape(line)):
-        processes.run(processes.local(2), die, who, how)
+        processes.run_group(processes.local(2), die, who, how)
     assert monotonic() - begin < 60
     assert not multiprocessing.active_children()
-    assert any(tmp_path.iterdir()) is (kind is processes.Lost)  # what it printed
+    assert any(tmp_path.iterdir()) is (kind is processes.LostProcessError)  # what it printed
 
 
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_process_that_is_missing_is_told_in_one_line(number, tmp_path):
+def test_a_process_that_is_missing_is_reported_in_one_line(number, tmp_path):
     """The command itself: the other one of two machines is never started."""
     port = processes.local(2).address.split(":")[1]
-    code = "import sys; from experiments import monte_carlo, processes; processes.WAIT = 6.0; "
-    code += "sys.exit(monte_carlo.main(sys.argv[1:]))"
+    code = "import sys; from experiments import monte_carlo, processes; "
+    code += "processes.STARTUP_TIMEOUT = 6.0; sys.exit(monte_carlo.main(sys.argv[1:]))"
     options = ["--coordinator_address", f"127.0.0.1:{port}", "--num_processes", "2"]
     options += ["--process_id", str(number), "--runs", "8", "--out", str(tmp_path)]
     begin = monotonic()
@@ -153,8 +152,8 @@ def test_a_process_that_is_missing_is_told_in_one_line(number, tmp_path):
 
 @pytest.mark.timeout(120)
 def test_no_process_outlives_the_one_that_started_it(tmp_path):
-    code = "from experiments import processes; from tests import test_many; "
-    code += "processes.run(processes.local(2), test_many.idle)"
+    code = "from experiments import processes; from tests.experiments import test_monte_carlo; "
+    code += "processes.run_group(processes.local(2), test_monte_carlo.idle)"
     own = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     parent = subprocess.Popen([sys.executable, "-c", code], env=own, stderr=subprocess.PIPE)
     try:
@@ -170,10 +169,10 @@ def test_no_process_outlives_the_one_that_started_it(tmp_path):
     assert not [pid for pid in started if os.path.exists(f"/proc/{pid}/exe")]
 
 
-def idle(say):
+def idle(stream):
     """Work that does not end."""
-    say.write("idle\n")
-    say.flush()
+    stream.write("idle\n")
+    stream.flush()
     sleep(600)
 
 
@@ -199,52 +198,46 @@ class Stop(Exception):
     pass
 
 
-def test_what_was_stopped_goes_on_and_gives_the_same(done, tmp_path, monkeypatch):
+def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_path, monkeypatch):
     """Stopped after the first file, as kill -9 would: a part of the next one is left."""
     folder = tmp_path / "runs"
-    monkeypatch.setattr(monte_carlo, "KEPT", 8)
+    monkeypatch.setattr(monte_carlo, "TRIALS_PER_FILE", 8)
     real = monte_carlo.keep
 
-    def stopping(*given):
-        real(*given)
+    def stopping(*arguments):
+        real(*arguments)
         raise Stop
 
     monkeypatch.setattr(monte_carlo, "keep", stopping)
     with pytest.raises(Stop):
-        monte_carlo.work(CASE, RUNS, folder, StringIO())
+        monte_carlo.work(CASE, NUM_TRIALS, folder, StringIO())
     monkeypatch.setattr(monte_carlo, "keep", real)
     (file,) = folder.iterdir()
     before = file.stat().st_mtime_ns
     (folder / ".123.tmp").write_bytes(b"half of")
-    numbers = monte_carlo.work(CASE, RUNS, folder, StringIO())
-    assert told(numbers) == told(done[0]) and file.stat().st_mtime_ns == before
+    numbers = monte_carlo.work(CASE, NUM_TRIALS, folder, StringIO())
+    assert untimed(numbers) == untimed(done[0]) and file.stat().st_mtime_ns == before
     assert [f.name for f in sorted(folder.glob("*.npz"))] == ["0000000.npz", "0000008.npz"]
 
 
-def test_runs_of_another_seed_or_program_are_not_mixed_in(done):
+def test_trials_of_another_seed_or_program_are_not_mixed_in(done):
     folder = done[1]
     with pytest.raises(InputError, match="of another seed"):
-        monte_carlo.work(CASE._replace(seed=6), RUNS, folder)
+        monte_carlo.work(CASE._replace(seed=6), NUM_TRIALS, folder)
 
 
-def test_marks_tell_all_that_matters_apart():
-    noise = NoiseParams.for_simulated_robot(*CASE.robot)
+def test_fingerprints_differ_for_all_that_matters():
+    params = NoiseParams.for_simulated_robot(*CASE.robot)
     cases = [
         CASE,
         CASE._replace(seed=1),
-        CASE._replace(steps=5),
-        CASE._replace(
-            config=CONFIG._replace(
-                filter=CONFIG.filter._replace(
-                    max_landmarks=8,
-                ),
-            )
-        ),
-        CASE._replace(max_walls=CASE.max_walls + 1e-9),
+        CASE._replace(num_scans=5),
+        CASE._replace(config=CONFIG._replace(filter=CONFIG.filter._replace(max_landmarks=8))),
+        CASE._replace(walls=CASE.walls + 1e-9),
         CASE._replace(robot=Robot(encoder_noise=0.1)),
     ]
-    assert len({monte_carlo.fingerprint(case, noise) for case in cases}) == len(cases)
-    assert monte_carlo.fingerprint(CASE, noise) == monte_carlo.fingerprint(CASE, noise)
+    assert len({monte_carlo.fingerprint(case, params) for case in cases}) == len(cases)
+    assert monte_carlo.fingerprint(CASE, params) == monte_carlo.fingerprint(CASE, params)
 
 
 def test_a_broken_file_is_named(tmp_path):
@@ -253,46 +246,46 @@ def test_a_broken_file_is_named(tmp_path):
         monte_carlo.load(tmp_path, "")
 
 
-def test_the_distribution_is_of_the_runs(done):
+def test_the_distribution_is_that_of_the_trials(done):
     numbers, folder = done
-    (tracks,), _, _ = monte_carlo.load(
+    (results,), _, _ = monte_carlo.load(
         folder, monte_carlo.fingerprint(CASE, NoiseParams.for_simulated_robot(*CASE.robot))
     )
-    off = np.linalg.norm((tracks.estimate - tracks.truth)[..., :2], axis=-1)
+    off = np.linalg.norm((results.estimate - results.truth)[..., :2], axis=-1)
     rmse = np.sqrt(np.mean(off**2, axis=1))
     assert numbers["p50_m"] == pytest.approx(np.median(rmse))
     assert numbers["p50_m"] <= numbers["p95_m"] <= numbers["p99_m"] <= rmse.max()
     assert numbers["position_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)))
-    assert sum(numbers["histogram"]["runs"]) == numbers["runs"] == RUNS
+    assert sum(numbers["histogram"]["runs"]) == numbers["runs"] == NUM_TRIALS
     worst = [one["run"] for one in numbers["worst"]]
     assert worst == np.argsort(-rmse, kind="stable")[: monte_carlo.WORST].tolist()
     assert numbers["largest_m"] == pytest.approx(off.max())
 
 
-def test_runs_in_no_number_are_masked_and_listed(done):
+def test_trials_that_are_not_finite_are_masked_and_listed(done):
     numbers, folder = done
     mark = monte_carlo.fingerprint(CASE, NoiseParams.for_simulated_robot(*CASE.robot))
-    (tracks,), _, _ = monte_carlo.load(folder, mark)
+    (results,), _, _ = monte_carlo.load(folder, mark)
     import jax
 
-    estimate = tracks.estimate.copy()
+    estimate = results.estimate.copy()
     estimate[3, 2] = np.nan
-    found = monte_carlo.summary(jax.random.key(5), tracks._replace(estimate=estimate))
-    assert found["nonfinite_runs"] == [3] and sum(found["histogram"]["runs"]) == RUNS - 1
+    found = monte_carlo.summary(jax.random.key(5), results._replace(estimate=estimate))
+    assert found["nonfinite_runs"] == [3] and sum(found["histogram"]["runs"]) == NUM_TRIALS - 1
     assert np.isfinite(found["p99_m"]) and 3 not in [one["run"] for one in found["worst"]]
     estimate[:] = np.nan
-    none = monte_carlo.summary(jax.random.key(5), tracks._replace(estimate=estimate))
+    none = monte_carlo.summary(jax.random.key(5), results._replace(estimate=estimate))
     assert none["p50_m"] is None and none["worst"] == []
 
 
-def test_one_run_is_replayed_alone(done):
+def test_one_trial_is_replayed_alone(done):
     worst = done[0]["worst"][0]
     alone = monte_carlo.replay(CASE, worst["run"])
     assert alone["position_rmse_m"] == pytest.approx(worst["position_rmse_m"], rel=1e-12)
     np.testing.assert_array_equal(alone["worst"][0]["estimate"], worst["estimate"])
 
 
-def test_picture_and_numbers_are_written_and_what_was_kept_goes(done, tmp_path, monkeypatch):
+def test_picture_and_numbers_are_written_and_kept_trials_are_removed(done, tmp_path, monkeypatch):
     row = {"devices": 1, "seconds": 2.0, "ms_per_scan": 1.0, "peak_mb": 500.0}
     rows = {name: [row | {name: v} for v in values] for name, values in scaling.VARIED.items()}
     rows["steps"] = [{"chain_note": "it failed"}]
@@ -300,7 +293,7 @@ def test_picture_and_numbers_are_written_and_what_was_kept_goes(done, tmp_path, 
     monkeypatch.setattr(scaling, "compute", lambda *_: rows | {"devices": two})
     monkeypatch.setattr(monte_carlo, "compute", lambda *_: dict(done[0]))
     (tmp_path / "monte_carlo_runs").mkdir()
-    assert monte_carlo.main(["--out", str(tmp_path), "--runs", str(RUNS)]) == 0
+    assert monte_carlo.main(["--out", str(tmp_path), "--runs", str(NUM_TRIALS)]) == 0
     numbers = json.loads((tmp_path / "monte_carlo.json").read_text())
     keys = "runs diverged nonfinite position_rmse_m p50_m p95_m p99_m seconds seconds_per_scan"
     assert {*keys.split(), "peak_mb", "devices", "scaling"} <= numbers.keys()
@@ -311,40 +304,47 @@ def test_picture_and_numbers_are_written_and_what_was_kept_goes(done, tmp_path, 
 def test_scaling_measures_each_figure_in_its_own_process(monkeypatch):
     asked = []
 
-    def measured(task, kept, *, devices, module, whole, **given):
-        assert whole
-        asked.append((devices, given["runs"], given["steps"], given["landmarks"]))
-        return {"seconds": 3.0 / devices, "devices": devices} | given
+    def measured(task, cache, arguments, *, num_devices, module, no_split):
+        assert no_split
+        asked.append((num_devices, arguments["runs"], arguments["steps"], arguments["landmarks"]))
+        return {"seconds": 3.0 / num_devices, "devices": num_devices} | arguments
 
-    monkeypatch.setattr(scaling, "apart", measured)
+    monkeypatch.setattr(scaling, "run_task", measured)
     numbers = scaling.compute(0)
     assert numbers["devices"]["two_vs_one"] == pytest.approx(2.0)
     for name, values in scaling.VARIED.items():
         assert [one[name] for one in numbers[name]] == list(values)
     assert {one[0] for one in asked} == {1, 2}
-    monkeypatch.setattr(scaling, "apart", lambda *_, **__: {"chain_note": "it failed"})
+    monkeypatch.setattr(scaling, "run_task", lambda *_, **__: {"chain_note": "it failed"})
     none = scaling.compute(0)["devices"]
     assert none == {"two_vs_one": None, "rows": [], "chain_note": "it failed"}
 
 
 @pytest.mark.timeout(60)
-def test_a_module_that_has_no_such_task_is_told(tmp_path):
-    done = estimator.apart("none", str(tmp_path), module="experiments.scaling")
+def test_a_task_that_a_module_does_not_have_has_a_note(tmp_path):
+    done = filter_benchmark.run_task("none", str(tmp_path), {}, module="experiments.scaling")
     assert "KeyError" in done["none_note"]
 
 
-def test_runs_that_diverged_are_listed_with_their_keys():
+def test_trials_that_diverged_are_listed_with_their_keys():
     key = jax.random.key(7)
     zero = np.zeros((3, 2, 3))
     off = zero.copy()
     off[1, 1, 0] = 3.0
-    flags = {"finite": np.ones(3, bool), "judged": np.ones((3, 2), bool)}
-    counts = {"matches": np.zeros((3, 2), np.int32), "landmarks": np.zeros(3, np.int32)}
-    rest = {"cov": np.tile(np.eye(3), (3, 2, 1, 1)), "length": np.full(3, 2, np.int32)}
-    tracks = TrialResult(truth=zero, estimate=off, dead_reckoning=zero, **flags, **counts, **rest)
-    told = monte_carlo.summary(key, tracks)
-    assert told["diverged_runs"] == [1]
+    results = TrialResult(
+        truth=zero,
+        estimate=off,
+        cov=np.tile(np.eye(3), (3, 2, 1, 1)),
+        dead_reckoning=zero,
+        num_updates=np.zeros((3, 2), np.int32),
+        num_landmarks=np.zeros(3, np.int32),
+        finite=np.ones(3, bool),
+        truth_mask=np.ones((3, 2), bool),
+        num_steps=np.full(3, 2, np.int32),
+    )
+    found = monte_carlo.summary(key, results)
+    assert found["diverged_runs"] == [1]
     own = jax.random.key_data(jax.random.fold_in(key, 1))
-    np.testing.assert_array_equal(told["diverged_keys"], [own])
-    none = monte_carlo.summary(key, tracks._replace(estimate=zero + 1e-3))
+    np.testing.assert_array_equal(found["diverged_keys"], [own])
+    none = monte_carlo.summary(key, results._replace(estimate=zero + 1e-3))
     assert none["diverged"] == 0 and none["diverged_keys"].shape == (0, 2)

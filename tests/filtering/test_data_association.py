@@ -1,4 +1,4 @@
-"""What is believed of matches, and the life of landmarks."""
+"""Matches that are verified, duplicates, missed detections, and the tracks of landmarks."""
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +16,15 @@ from jaxslam.filtering.kalman import innovation_cov
 from jaxslam.frontend.features import features_from_range_bearing
 
 L = 6
-PLACES = np.array([[3.0, 0.0], [3.2, 0.0], [0.0, 3.0], [-3.0, 0.0], [0.0, -3.0]])
+POSITIONS = np.array([[3.0, 0.0], [3.2, 0.0], [0.0, 3.0], [-3.0, 0.0], [0.0, -3.0]])
 
 
-def known(*, std=0.05, pose_std=0.0):
-    """A belief in five nodes of clearance 1 m, seen twice; pose errors are theirs alone."""
+def five_landmarks(*, std=0.05, pose_std=0.0):
+    """A belief with five junctions of clearance 1 m, observed twice, independent of the pose."""
     cov = jnp.diag(jnp.full(3, pose_std**2))
     belief = initial_belief(jnp.zeros(3), max_landmarks=L, cov=cov)
     belief = add_known_landmarks(
-        belief, jnp.array(PLACES), jnp.tile(std**2 * jnp.eye(2), (5, 1, 1))
+        belief, jnp.array(POSITIONS), jnp.tile(std**2 * jnp.eye(2), (5, 1, 1))
     )
     return belief._replace(
         num_seen=jnp.array([2, 2, 2, 2, 2, 0], jnp.int32), descriptor=jnp.ones(L), step=jnp.int32(9)
@@ -32,7 +32,7 @@ def known(*, std=0.05, pose_std=0.0):
 
 
 def reference(s, residual, rank, rounds):
-    """Take out, one at a time, the pair without which the rest makes most sense."""
+    """Remove, one at a time, the match without which the distance of the others is smallest."""
     left = [k for k in range(len(rank)) if rank[k] > 0]
     for _ in range(rounds):
 
@@ -47,7 +47,7 @@ def reference(s, residual, rank, rounds):
     return np.isin(np.arange(len(rank)), left)
 
 
-def test_greedy_joint_compatibility_is_its_definition():
+def test_greedy_joint_compatibility_equals_its_definition():
     fast, sizes = jax.jit(jointly_compatible), []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -65,67 +65,74 @@ def test_greedy_joint_compatibility_is_its_definition():
 
 
 @jax.jit
-def look(belief, polar, slot):
-    nodes = features_from_range_bearing(polar, jnp.ones(len(polar), bool))
+def verify(belief, polar, slot):
+    features = features_from_range_bearing(polar, jnp.ones(len(polar), bool))
     r = jnp.tile(jnp.diag(jnp.array([0.01, 0.005]) ** 2), (len(polar), 1, 1))
-    rows = ekf.linearize(belief, nodes, r, slot)
+    rows = ekf.linearize(belief, features, r, slot)
     s = innovation_cov(ekf.covariance_blocks(belief), rows)
-    return match_verification.verify_matches(AssociationSpec(), belief, nodes, rows, s)
+    return match_verification.verify_matches(AssociationSpec(), belief, features, rows, s)
 
 
-def looked(belief, polar, slot):
+def verified(belief, polar, slot):
+    """The accepted matches, and the numbers of pending ones, of one or two features."""
     polar = np.concatenate([polar, np.ones((2 - len(polar), 2))])
     slot = [*slot, *[L] * (2 - len(slot))]
-    believed, looks = look(belief, jnp.array(polar), jnp.array(slot, jnp.int32))
+    accepted, num_pending = verify(belief, jnp.array(polar), jnp.array(slot, jnp.int32))
     used = np.array(slot) < L
-    return np.asarray(believed)[used], np.asarray(looks)
+    return np.asarray(accepted)[used], np.asarray(num_pending)
 
 
-def test_a_place_in_a_wide_gate_needs_a_witness_or_a_second_look():
-    lost = known(pose_std=0.5)
-    believed, looks = looked(lost, [[3.1, 0.1]], [0])
-    assert not believed[0] and looks[0] == 1
-    assert looked(lost._replace(num_pending=jnp.array(looks)), [[3.1, 0.1]], [0])[0][0]
-    # Two that lie as the map says vouch for each other; a pair that does not fit is left.
-    assert looked(lost, [[3.0, 0.1], [3.0, np.pi / 2 + 0.1]], [0, 2])[0].all()
-    assert not looked(lost, [[3.0, 0.1], [4.0, np.pi / 2 + 0.1]], [0, 2])[0].any()
-    assert looked(known(), [[3.02, 0.0]], [0])[0][0]  # who is not lost needs no witness
+def test_a_match_in_a_wide_gate_needs_a_second_match_or_a_second_scan():
+    uncertain = five_landmarks(pose_std=0.5)
+    accepted, num_pending = verified(uncertain, [[3.1, 0.1]], [0])
+    assert not accepted[0] and num_pending[0] == 1
+    again = uncertain._replace(num_pending=jnp.array(num_pending))
+    assert verified(again, [[3.1, 0.1]], [0])[0][0]
+    # Two at the distance of the map support each other; a pair at another distance is rejected.
+    assert verified(uncertain, [[3.0, 0.1], [3.0, np.pi / 2 + 0.1]], [0, 2])[0].all()
+    assert not verified(uncertain, [[3.0, 0.1], [4.0, np.pi / 2 + 0.1]], [0, 2])[0].any()
+    assert verified(five_landmarks(), [[3.02, 0.0]], [0])[0][0]  # a certain pose needs no support
 
 
-def test_dropped_rows_stand_for_nothing():
-    belief = known(pose_std=0.1)
-    nodes = features_from_range_bearing(jnp.array([[3.0, 0.1], [3.1, 1.5]]), jnp.ones(2, bool))
+def test_masked_measurements_change_nothing():
+    belief = five_landmarks(pose_std=0.1)
+    polar = jnp.array([[3.0, 0.1], [3.1, 1.5]])
+    features = features_from_range_bearing(polar, jnp.ones(2, bool))
     r = jnp.tile(1e-4 * jnp.eye(2), (2, 1, 1))
 
     @jax.jit
     def updated(slot, keep):
-        return ekf.update(belief, mask_measurements(ekf.linearize(belief, nodes, r, slot), keep))
+        return ekf.update(belief, mask_measurements(ekf.linearize(belief, features, r, slot), keep))
 
-    mine = updated(jnp.array([0, 2], jnp.int32), jnp.array([True, False]))
-    none = updated(jnp.array([0, L], jnp.int32), jnp.array([True, True]))
-    jax.tree.map(np.testing.assert_array_equal, mine, none)
+    masked = updated(jnp.array([0, 2], jnp.int32), jnp.array([True, False]))
+    unmatched = updated(jnp.array([0, L], jnp.int32), jnp.array([True, True]))
+    jax.tree.map(np.testing.assert_array_equal, masked, unmatched)
 
 
-def test_the_twin_of_a_landmark_is_like_it_and_where_it_is():
+def test_a_duplicate_resembles_the_landmark_and_is_at_its_position():
     find = jax.jit(
         lambda belief, slot: match_verification.find_duplicate(AssociationSpec(), belief, slot)
     )
-    near, slot = known(std=0.1), jnp.int32
+    near, slot = five_landmarks(std=0.1), jnp.int32
     assert find(near, slot(0)) == 1 and find(near, slot(1)) == 0
     assert find(near, slot(2)) == L and find(near, slot(L)) == L
-    assert find(known(std=0.01), slot(0)) == L  # apart, and known to be
-    other = lambda **change: near._replace(**change)
-    assert find(other(shape=near.descriptor.at[1].set(2.0)), slot(0)) == L
-    assert find(other(kind=near.kind.at[1].set(CORNER)), slot(0)) == L
-    assert find(other(kind=jnp.full(L, WALL, jnp.int32)), slot(0)) == L
-    assert find(other(seen=near.num_seen.at[1].set(0)), slot(0)) == L
+    assert find(five_landmarks(std=0.01), slot(0)) == L  # certainly apart
+    for other in (
+        near._replace(descriptor=near.descriptor.at[1].set(2.0)),
+        near._replace(kind=near.kind.at[1].set(CORNER)),
+        near._replace(kind=jnp.full(L, WALL, jnp.int32)),
+        near._replace(num_seen=near.num_seen.at[1].set(0)),
+    ):
+        assert find(other, slot(0)) == L
 
 
-def test_merging_conditions_on_one_place_and_leaves_one_landmark():
+def test_merging_conditions_on_one_position_and_leaves_one_landmark():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(15, 15))
     cov = jnp.array(root @ root.T)
-    belief = known()._replace(pose_cov=cov[:3, :3], cross_cov=cov[:3, 3:], map_cov=cov[3:, 3:])
+    belief = five_landmarks()._replace(
+        pose_cov=cov[:3, :3], cross_cov=cov[:3, 3:], map_cov=cov[3:, 3:]
+    )
     after = jax.jit(map_management.merge)(belief, jnp.int32(1), jnp.int32(3))
     h = np.zeros((2, 15))
     h[:, 5:7], h[:, 9:11] = np.eye(2), -np.eye(2)
@@ -137,18 +144,18 @@ def test_merging_conditions_on_one_place_and_leaves_one_landmark():
     jax.tree.map(np.testing.assert_array_equal, same, belief)
 
 
-def test_worth_is_nothing_of_free_slots_and_all_of_what_counts():
-    belief = known()._replace(
+def test_eviction_costs_nothing_for_free_slots_and_is_infinite_for_confirmed_landmarks():
+    belief = five_landmarks()._replace(
         num_seen=jnp.array([1, 1, 2, 5, 1, 0], jnp.int32),
         last_seen=jnp.array([2, 1, 1, 1, 8, 0], jnp.int32),
     )
     value = np.asarray(eviction_cost(belief, belief.num_seen > 3, evict_after=5))
-    assert value[5] == 0 and np.isinf(value[[3, 4]]).all()  # free; counts; seen just now
-    assert 0 < value[1] < value[0] < value[2] < np.inf  # longest unseen, then least seen
+    assert value[5] == 0 and np.isinf(value[[3, 4]]).all()  # free; confirmed; observed just now
+    assert 0 < value[1] < value[0] < value[2] < np.inf  # oldest, then least observed
 
 
 @pytest.mark.parametrize("bad", ["asymmetric", "indefinite", "nan", "too many"])
-def test_what_is_known_beforehand_is_checked(bad):
+def test_known_landmarks_are_checked(bad):
     cov = np.tile(np.eye(2), (5, 1, 1))
     if bad == "asymmetric":
         cov[2, 0, 1] = 0.5
@@ -156,25 +163,29 @@ def test_what_is_known_beforehand_is_checked(bad):
         cov[2] = [[1.0, 2.0], [2.0, 1.0]]
     elif bad == "nan":
         cov[2, 0, 0] = np.nan
-    told = {
+    message = {
         "asymmetric": r"cov\[2\] is not symmetric: \[0, 1\] is 0.5, \[1, 0\] 0",
         "indefinite": r"cov\[2\] is not positive definite: its smallest eigenvalue is -1",
         "nan": r"cov\[2\] holds numbers that are not finite",
-        "too many": "5 positions for a map of 4 landmarks",
+        "too many": "positions holds 5 landmarks, and the belief has 4 slots",
     }
     blank = initial_belief(jnp.zeros(3), max_landmarks=4 if bad == "too many" else L)
-    with pytest.raises(ValueError, match=told[bad]):
-        add_known_landmarks(blank, jnp.array(PLACES), jnp.array(cov))
+    with pytest.raises(ValueError, match=message[bad]):
+        add_known_landmarks(blank, jnp.array(POSITIONS), jnp.array(cov))
     with pytest.raises(ValueError, match="cov is not positive semi-definite"):
         initial_belief(jnp.zeros(3), max_landmarks=L, cov=jnp.diag(jnp.array([1.0, 1.0, -1.0])))
 
 
-@pytest.mark.parametrize("bearing, due", [(0.0, True), (np.pi, False)])
-def test_a_node_is_overdue_when_the_robot_is_inside_its_circle_and_looks_there(bearing, due):
-    belief = known()._replace(descriptor=jnp.full(L, 8.0), kind=jnp.full(L, JUNCTION, jnp.int32))
+@pytest.mark.parametrize("bearing, missed", [(0.0, True), (np.pi, False)])
+def test_a_detection_is_missed_when_the_robot_is_inside_the_circle_and_faces_the_junction(
+    bearing, missed
+):
+    belief = five_landmarks()._replace(
+        descriptor=jnp.full(L, 8.0), kind=jnp.full(L, JUNCTION, jnp.int32)
+    )
     belief = belief._replace(mean=belief.mean.at[2].set(-bearing))
     half = match_verification.missed_detection(belief, (-np.pi / 2, np.pi / 2))
-    assert bool(half[0]) is due and not half[5]  # a free slot is no node
+    assert bool(half[0]) is missed and not half[5]  # a free slot is no landmark
     assert match_verification.missed_detection(belief, (-np.pi, np.pi))[0]
     assert not match_verification.missed_detection(
         belief._replace(descriptor=jnp.ones(L)), (-np.pi, np.pi)

@@ -1,3 +1,5 @@
+"""Prediction, update and new landmarks, against dense EKF-SLAM, filterpy and samples."""
+
 import warnings
 
 import jax
@@ -18,13 +20,13 @@ with warnings.catch_warnings():
 
 L, M = 8, 5
 KINDS = np.array([JUNCTION, WALL, CORNER, JUNCTION, WALL, CORNER])
-PLACES = np.array([[4.0, 1.0], [0.3, 0.0], [-2.0, 3.0], [1.0, -4.0], [-1.2, 0.0], [6.0, 5.0]])
+POSITIONS = np.array([[4.0, 1.0], [0.3, 0.0], [-2.0, 3.0], [1.0, -4.0], [-1.2, 0.0], [6.0, 5.0]])
 RANGE_STD, BEARING_STD, WALL_STD = 0.05, 0.02, 0.01
 Q = np.diag([0.03, 0.01, 0.02]) ** 2 + 1e-5
 
 
 def features(kind, seen):
-    """Features (M,) of observations (k, 2): range and bearing, or direction and 0; and their R."""
+    """Features (M) of measurements (k, 2), range and bearing or direction and 0; and their R."""
     return jax.tree.map(jnp.asarray, plain_features(kind, seen))
 
 
@@ -35,8 +37,11 @@ def plain_features(kind, seen):
     is_wall = kind == WALL
     xy = seen[:, :1] * np.stack([np.cos(seen[:, 1]), np.sin(seen[:, 1])], axis=-1)
     zero = np.zeros(M)
-    fill = lambda x: np.concatenate([x, np.zeros((pad,) + x.shape[1:], x.dtype)])
-    nodes = Features(
+
+    def fill(x):
+        return np.concatenate([x, np.zeros((pad,) + x.shape[1:], x.dtype)])
+
+    padded = Features(
         kind=fill(kind.astype(np.int32)),
         xy=fill(np.where(is_wall[:, None], 0.0, xy)),
         cov=np.zeros((M, 2, 2)),
@@ -50,7 +55,7 @@ def plain_features(kind, seen):
     )
     point = np.diag([RANGE_STD, BEARING_STD]) ** 2 + 1e-4
     wall = np.diag([WALL_STD**2, 1.0])
-    return nodes, np.where((nodes.kind == WALL)[:, None, None], wall, point)
+    return padded, np.where((padded.kind == WALL)[:, None, None], wall, point)
 
 
 def slots(*numbers):
@@ -58,19 +63,19 @@ def slots(*numbers):
 
 
 @jax.jit
-def moved(belief, motion, q):
+def predicted(belief, motion, q):
     return ekf.predict(belief, motion, q)
 
 
 @jax.jit
-def conditioned(belief, nodes, r, slot):
-    belief, done = ekf.update(belief, ekf.linearize(belief, nodes, r, slot))
-    return belief, done.nis, done.logdet
+def updated(belief, scan, r, slot):
+    belief, result = ekf.update(belief, ekf.linearize(belief, scan, r, slot))
+    return belief, result.nis, result.logdet
 
 
 @jax.jit
-def enlarged(belief, nodes, r, wanted):
-    return map_management.augment(belief, nodes, r, wanted, max_new=3)
+def augmented(belief, scan, r, wanted):
+    return map_management.augment(belief, scan, r, wanted, max_new=3)
 
 
 def with_cov(belief, cov):
@@ -83,7 +88,7 @@ def random_belief(seed, *, landmarks=4):
     rng = np.random.default_rng(seed)
     used = 3 + 2 * landmarks
     root = 0.1 * rng.normal(size=(used, used))
-    mean = np.concatenate([[0.3, -0.2, 0.7], PLACES[:landmarks].ravel()])
+    mean = np.concatenate([[0.3, -0.2, 0.7], POSITIONS[:landmarks].ravel()])
     # A direction has one number; the other is a certain zero.
     for slot in np.flatnonzero(KINDS[:landmarks] == WALL):
         root[4 + 2 * slot] = 0.0
@@ -104,8 +109,8 @@ def dense_of(belief, landmarks):
 
 
 def observed(rng, pose, index):
-    """Noisy observation of the true landmark `index` from `pose`, in the form of `features`."""
-    truth = np.concatenate([pose, PLACES.ravel()])
+    """Noisy measurement of the true landmark `index` from `pose`, in the form of `features`."""
+    truth = np.concatenate([pose, POSITIONS.ravel()])
     expected, _ = reference_filter.observe(truth, index, KINDS[index])
     if KINDS[index] == WALL:
         return np.array([expected[0] + WALL_STD * rng.normal(), 0.0])
@@ -120,26 +125,24 @@ def test_twenty_steps_equal_dense_ekf_slam(seed):
     slot_of, order = {}, []
     for _ in range(20):
         pose = reference_filter.compose(pose, motion + rng.multivariate_normal(np.zeros(3), Q))
-        belief = moved(belief, jnp.array(motion), jnp.array(Q))
+        belief = predicted(belief, jnp.array(motion), jnp.array(Q))
         dense.predict(motion, Q)
 
         index = rng.choice(len(KINDS), 4, replace=False)
-        kind, seen = KINDS[index], np.array([observed(rng, pose, i) for i in index])
-        nodes, r = features(kind, seen)
+        kind, measured = KINDS[index], np.array([observed(rng, pose, i) for i in index])
+        scan, r = features(kind, measured)
         size = np.where(kind == WALL, 1, 2)
-        cut = [(seen[n, :k], np.asarray(r)[n, :k, :k]) for n, k in enumerate(size)]
+        cut = [(measured[n, :k], np.asarray(r)[n, :k, :k]) for n, k in enumerate(size)]
         known = [n for n, i in enumerate(index) if i in slot_of]
-        belief, nis, logdet = conditioned(
-            belief, nodes, r, slots(*[slot_of.get(i, L) for i in index])
-        )
+        belief, nis, logdet = updated(belief, scan, r, slots(*[slot_of.get(i, L) for i in index]))
         if known:
             expected = dense.update([(order.index(index[n]), kind[n], *cut[n]) for n in known])
-            # Our wall rows carry an idle second number of variance 1.
+            # Our wall rows have an unused second number of variance 1.
             np.testing.assert_allclose([nis, logdet], expected, atol=1e-8)
-        fresh = [n for n in range(4) if n not in known][:3]
-        wanted = jnp.zeros(M, bool).at[jnp.array(fresh, int)].set(True)
-        belief, got = enlarged(belief, nodes, r, wanted)
-        for n in fresh:
+        new = [n for n in range(4) if n not in known][:3]
+        wanted = jnp.zeros(M, bool).at[jnp.array(new, int)].set(True)
+        belief, got = augmented(belief, scan, r, wanted)
+        for n in new:
             dense.augment(kind[n], *cut[n])
             slot_of[index[n]] = int(got[n])
             order.append(index[n])
@@ -154,8 +157,8 @@ def test_twenty_steps_equal_dense_ekf_slam(seed):
 def test_predict_and_update_equal_filterpy():
     belief, landmarks = random_belief(0, landmarks=4), [0, 2, 3]
     motion, seen = np.array([0.4, -0.1, 0.3]), np.array([[3.9, 0.2], [3.1, -2.9], [4.0, -1.6]])
-    nodes, r = features(KINDS[landmarks], seen)
-    ours, nis, _ = conditioned(moved(belief, motion, jnp.array(Q)), nodes, r, slots(*landmarks))
+    scan, r = features(KINDS[landmarks], seen)
+    ours, nis, _ = updated(predicted(belief, motion, jnp.array(Q)), scan, r, slots(*landmarks))
 
     used = 3 + 2 * 4
 
@@ -172,11 +175,14 @@ def test_predict_and_update_equal_filterpy():
     theirs.Q[:3, :3] = by_motion @ Q @ by_motion.T
     theirs.predict(motion)
     theirs.R = np.kron(np.eye(3), np.asarray(r[0]))
-    views = lambda x: [reference_filter.observe(x, i, JUNCTION) for i in landmarks]
+
+    def predictions(x):
+        return [reference_filter.observe(x, i, JUNCTION) for i in landmarks]
+
     theirs.update(
         seen.ravel(),
-        lambda x: np.vstack([h for _, h in views(x)]),
-        lambda x: np.concatenate([z for z, _ in views(x)]),
+        lambda x: np.vstack([h for _, h in predictions(x)]),
+        lambda x: np.concatenate([z for z, _ in predictions(x)]),
         residual=lambda a, b: np.concatenate(
             [reference_filter.difference(a[k : k + 2], b[k : k + 2], JUNCTION) for k in (0, 2, 4)]
         ),
@@ -190,8 +196,8 @@ def test_heading_and_wall_directions_are_a_linear_kalman_filter():
     rng = np.random.default_rng(1)
     walls, q, r = np.array([0.3, -0.4]), 0.02**2, WALL_STD**2
     belief = initial_belief(jnp.array([1.0, 2.0, 0.1]), max_landmarks=L)
-    nodes, noise = features([WALL, WALL], np.array([[0.2, 0], [-0.5, 0]]))
-    belief, _ = enlarged(belief, nodes, noise, nodes.valid)
+    scan, noise = features([WALL, WALL], np.array([[0.2, 0], [-0.5, 0]]))
+    belief, _ = augmented(belief, scan, noise, scan.valid)
     mean, cov = np.array([0.1, 0.3, -0.4]), np.diag([0.0, r, r])
     h, f = np.array([[-1.0, 1, 0], [-1, 0, 1]]), np.eye(3)
     at = np.array([2, 3, 5])
@@ -200,48 +206,49 @@ def test_heading_and_wall_directions_are_a_linear_kalman_filter():
         mean, cov = reference_filter.kalman(
             mean, cov, f, np.diag([q, 0, 0]), [turn, 0, 0], h, r * np.eye(2), seen
         )
-        belief = moved(belief, jnp.array([0, 0, turn]), jnp.diag(jnp.array([0, 0, q])))
-        nodes, noise = features([WALL, WALL], np.stack([seen, 0 * seen], axis=-1))
-        belief, _, _ = conditioned(belief, nodes, noise, slots(0, 1))
+        belief = predicted(belief, jnp.array([0, 0, turn]), jnp.diag(jnp.array([0, 0, q])))
+        scan, noise = features([WALL, WALL], np.stack([seen, 0 * seen], axis=-1))
+        belief, _, _ = updated(belief, scan, noise, slots(0, 1))
         np.testing.assert_allclose(belief.mean[at], mean, atol=1e-12)
         np.testing.assert_allclose(belief.cov[np.ix_(at, at)], cov, atol=1e-15)
     np.testing.assert_allclose(belief.pose[:2], [1.0, 2.0], atol=1e-15)
 
 
 @jax.jit
-def expect_and_derive(pose, place, kind):
-    first = lambda pose, place: measurement_model.predict_measurement(pose, place, kind)[0]
-    return measurement_model.predict_measurement(pose, place, kind), jax.jacfwd(first, (0, 1))(
-        pose, place
-    )
+def predict_and_derive(pose, position, kind):
+    def prediction(pose, position):
+        return measurement_model.predict_measurement(pose, position, kind)[0]
+
+    derivatives = jax.jacfwd(prediction, (0, 1))(pose, position)
+    return measurement_model.predict_measurement(pose, position, kind), derivatives
 
 
 @pytest.mark.parametrize("kind", [JUNCTION, CORNER, WALL])
-@pytest.mark.parametrize("place", [(1.0, 2.0), (-0.7, 0.2), (0.2, -3.0)])
-def test_jacobians_of_expect_are_its_derivatives(kind, place):
-    pose, place = jnp.array([0.3, -0.2, 2.5]), jnp.array(place)
-    (_, *ours), derived = expect_and_derive(pose, place, jnp.int32(kind))
+@pytest.mark.parametrize("position", [(1.0, 2.0), (-0.7, 0.2), (0.2, -3.0)])
+def test_jacobians_of_the_prediction_are_its_derivatives(kind, position):
+    pose, position = jnp.array([0.3, -0.2, 2.5]), jnp.array(position)
+    (_, *ours), derived = predict_and_derive(pose, position, jnp.int32(kind))
     np.testing.assert_allclose(ours[0], derived[0], atol=1e-12)
     np.testing.assert_allclose(ours[1], derived[1], atol=1e-12)
 
 
-def test_expect_is_relative_to_the_heading():
-    expected = measurement_model.predict_measurement(
+def test_a_predicted_bearing_is_relative_to_the_heading():
+    prediction = measurement_model.predict_measurement(
         jnp.array([1.0, 1.0, 0.5]), jnp.array([1.0, 3.0]), jnp.int32(JUNCTION)
     )[0]
-    np.testing.assert_allclose(expected, [2.0, np.pi / 2 - 0.5], atol=1e-12)
+    np.testing.assert_allclose(prediction, [2.0, np.pi / 2 - 0.5], atol=1e-12)
 
 
 def test_a_landmark_where_the_robot_is_gives_finite_values_and_gradients():
     belief = random_belief(0, landmarks=1)
     belief = belief._replace(mean=belief.mean.at[3:5].set(belief.mean[:2]))
-    nodes, r = features([JUNCTION, JUNCTION], np.array([[0.1, 0.3], [0.0, 0.0]]))
+    scan, r = features([JUNCTION, JUNCTION], np.array([[0.1, 0.3], [0.0, 0.0]]))
 
     def total(mean, cov, r):
         now = with_cov(belief, cov)._replace(mean=mean)
-        now, nis, logdet = conditioned(now, nodes, r, slots(0))
-        now, _ = enlarged(now, nodes, r, jnp.arange(M) == 1)
-        distance = data_association.mahalanobis_distances(now, nodes, r)[:2, :2]
+        now, nis, logdet = updated(now, scan, r, slots(0))
+        now, _ = augmented(now, scan, r, jnp.arange(M) == 1)
+        distance = data_association.mahalanobis_distances(now, scan, r)[:2, :2]
         return jnp.sum(now.mean) + jnp.sum(now.cov) + nis + logdet + jnp.sum(distance)
 
     both = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2)))
@@ -251,18 +258,18 @@ def test_a_landmark_where_the_robot_is_gives_finite_values_and_gradients():
 
 def test_distances_are_the_norms_of_single_updates():
     belief = random_belief(3)
-    nodes, r = features(KINDS[:4], [[3.9, 0.2], [-0.3, 0], [4.3, 1.7], [4.0, -1.6]])
-    distance = np.asarray(jax.jit(data_association.mahalanobis_distances)(belief, nodes, r))
+    scan, r = features(KINDS[:4], [[3.9, 0.2], [-0.3, 0], [4.3, 1.7], [4.0, -1.6]])
+    distance = np.asarray(jax.jit(data_association.mahalanobis_distances)(belief, scan, r))
     for n in range(4):
         single = slots(*[n if k == n else L for k in range(4)])
-        _, nis, _ = conditioned(belief, nodes, r, single)
+        _, nis, _ = updated(belief, scan, r, single)
         np.testing.assert_allclose(distance[n, n], nis, rtol=1e-9)
 
 
 def test_zero_matches_change_nothing():
     belief = random_belief(0)
-    nodes, r = features(KINDS[:3], np.ones((3, 2)))
-    after, nis, logdet = conditioned(belief, nodes, r, slots())
+    scan, r = features(KINDS[:3], np.ones((3, 2)))
+    after, nis, logdet = updated(belief, scan, r, slots())
     jax.tree.map(np.testing.assert_array_equal, after, belief)
     assert nis == 0 and logdet == 0
 
@@ -270,43 +277,43 @@ def test_zero_matches_change_nothing():
 @pytest.mark.parametrize("junk", [7.0, -1e3])
 def test_unmatched_features_are_invisible_in_values_and_gradients(junk):
     belief = random_belief(0)
-    nodes, r = features(KINDS[:3], [[3.9, 0.2], [-0.3, 0], [4.3, 1.7]])
-    dirty = nodes._replace(
-        xy=nodes.xy.at[2:].set(junk),
-        direction=nodes.direction.at[2:].set(junk),
-        kind=nodes.kind.at[2:].set(WALL),
+    scan, r = features(KINDS[:3], [[3.9, 0.2], [-0.3, 0], [4.3, 1.7]])
+    dirty = scan._replace(
+        xy=scan.xy.at[2:].set(junk),
+        direction=scan.direction.at[2:].set(junk),
+        kind=scan.kind.at[2:].set(WALL),
     )
 
-    def total(r, nodes):
-        after, nis, logdet = conditioned(belief, nodes, r, slots(0, 1))
+    def total(r, scan):
+        after, nis, logdet = updated(belief, scan, r, slots(0, 1))
         return jnp.sum(after.mean[:7]) + jnp.sum(after.cov[:7, :7]) + nis + logdet
 
     both = jax.jit(jax.value_and_grad(total))
-    clean, dirty = both(r, nodes), both(r.at[2:].set(abs(junk)), dirty)
+    clean, dirty = both(r, scan), both(r.at[2:].set(abs(junk)), dirty)
     jax.tree.map(np.testing.assert_array_equal, clean, dirty)
     assert np.any(clean[1][:2] != 0) and not np.any(clean[1][2:])
 
 
 def test_a_new_landmark_has_the_moments_of_samples():
-    """Against 200 000 samples of pose and observation; tolerance 5 standard errors and the bend.
+    """Against 200 000 samples of pose and measurement.
 
-    With errors of a few hundredths of a radian over 4 m the second-order terms that an EKF leaves
-    out stay below 1e-5 m^2.
+    The tolerance is 5 standard errors and what the linearisation neglects: with errors of a few
+    hundredths of a radian over 4 m, its second-order terms stay below 1e-5 m^2.
     """
     samples, rng = 200_000, np.random.default_rng(0)
     pose, small = np.array([0.3, -0.2, 0.7]), 0.02
     root = small * rng.normal(size=(3, 3))
     belief = initial_belief(jnp.array(pose), max_landmarks=L)
     belief = belief._replace(pose_cov=root @ root.T)
-    nodes, r = features([JUNCTION], [[4.0, 0.6]])
-    after, slot = enlarged(belief, nodes, r, nodes.valid)
+    scan, r = features([JUNCTION], [[4.0, 0.6]])
+    after, slot = augmented(belief, scan, r, scan.valid)
     assert slot[0] == 0
 
     poses = pose + rng.normal(size=(samples, 3)) @ root.T
     seen = rng.multivariate_normal([4.0, 0.6], np.asarray(r[0]), samples)
     angle = poses[:, 2] + seen[:, 1]
-    place = poses[:, :2] + seen[:, :1] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    sampled = np.cov(np.hstack([poses, place]).T)
+    position = poses[:, :2] + seen[:, :1] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    sampled = np.cov(np.hstack([poses, position]).T)
     error = np.sqrt((np.outer(np.diag(sampled), np.diag(sampled)) + sampled**2) / samples)
     assert np.all(np.abs(after.cov[:5, :5] - sampled) < 5 * error + 1e-5)
     assert np.abs(sampled[:3, 3:]).max() > 50 * error[:3, 3:].max()
@@ -314,8 +321,8 @@ def test_a_new_landmark_has_the_moments_of_samples():
 
 def test_augment_leaves_the_rest_of_the_belief_alone_and_counts_ids():
     belief = random_belief(0)._replace(next_id=jnp.int32(7), step=jnp.int32(3))
-    nodes, r = features([JUNCTION, WALL, CORNER, JUNCTION], np.ones((4, 2)))
-    after, slot = enlarged(belief, nodes, r, jnp.array([False, True, True, True, False]))
+    scan, r = features([JUNCTION, WALL, CORNER, JUNCTION], np.ones((4, 2)))
+    after, slot = augmented(belief, scan, r, jnp.array([False, True, True, True, False]))
     np.testing.assert_array_equal(slot, [L, 4, 5, 6, L])
     np.testing.assert_array_equal(after.mean[:11], belief.mean[:11])
     np.testing.assert_array_equal(after.cov[:11, :11], belief.cov[:11, :11])
@@ -325,15 +332,15 @@ def test_augment_leaves_the_rest_of_the_belief_alone_and_counts_ids():
     assert after.next_id == 10
 
 
-def test_a_slot_that_is_used_again_keeps_nothing_of_its_past():
+def test_a_reused_slot_keeps_nothing_of_its_last_landmark():
     belief = random_belief(0)
-    nodes, r = features([JUNCTION], [[2.0, 0.4]])
+    scan, r = features([JUNCTION], [[2.0, 0.4]])
     freed = prune(belief, jnp.arange(L) == 1)
     cov = freed.cov.at[5:7].set(0.0).at[:, 5:7].set(0.0)
     blank = with_cov(freed, cov)._replace(
         mean=freed.mean.at[5:7].set(0.0), first_estimate=freed.first_estimate.at[5:7].set(0.0)
     )
-    one, two = (enlarged(b, nodes, r, nodes.valid)[0] for b in (freed, blank))
+    one, two = (augmented(b, scan, r, scan.valid)[0] for b in (freed, blank))
     assert one.num_seen[1] == 1
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
@@ -350,8 +357,10 @@ def test_covariance_stays_symmetric_and_positive_definite_in_float32():
     inputs = jax.tree.map(lambda *x: np.stack(x), *seen)
 
     def run(dtype):
-        cast = lambda x: jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype)
-        nodes, r = jax.tree.map(cast, inputs)
+        def cast(x):
+            return jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype)
+
+        scan, r = jax.tree.map(cast, inputs)
         motions, q = jnp.asarray(motion, dtype), jnp.asarray(Q, dtype)
 
         def body(belief, now):
@@ -366,7 +375,7 @@ def test_covariance_stays_symmetric_and_positive_definite_in_float32():
             first, _ = map_management.augment(first, *earliest, jnp.ones(M, bool), max_new=M)
             return jax.lax.scan(body, first, now)[1]
 
-        out = whole(initial_belief(jnp.zeros(3, dtype), max_landmarks=M), (nodes, r))
+        out = whole(initial_belief(jnp.zeros(3, dtype), max_landmarks=M), (scan, r))
         assert out[0].dtype == dtype
         return jax.tree.map(np.asarray, out)
 
@@ -377,7 +386,7 @@ def test_covariance_stays_symmetric_and_positive_definite_in_float32():
     scale = np.sqrt(np.diagonal(double[1], axis1=1, axis2=2))
     scale = np.maximum(scale[:, :, None] * scale[:, None], 1e-12)
     assert np.max(np.abs(cov - np.swapaxes(cov, 1, 2)) / scale) < 1e-5
-    real = np.flatnonzero(np.arange(3 + 2 * M) != 6)  # without the idle number of the wall
+    real = np.flatnonzero(np.arange(3 + 2 * M) != 6)  # without the unused number of the wall
     used = [c[:, real[:, None], real].astype(float) for c in (cov, double[1])]
     least = [np.linalg.eigvalsh(c)[:, 0] for c in used]
     assert np.all(least[0] > 0.5 * least[1]) and np.all(least[1] > 0)

@@ -1,4 +1,4 @@
-"""Conditioning and its derivative, against the textbook's formulas and their derivatives."""
+"""The Kalman update and its derivative, against the textbook's formulas and theirs."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ WEIGHT = np.random.default_rng(9).normal(size=(2, 3 + 2 * L, 3 + 2 * L))
 
 
 def problem(seed, *, used=M):
-    """A covariance (D, D) and M rows, of which `used` count."""
+    """A covariance (D, D) and M measurements, of which `used` are not padding."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3 + 2 * L, 3 + 2 * L))
     r = rng.normal(size=(M, 2, 2))
@@ -36,7 +36,7 @@ def blocks(cov):
 
 
 def whole(cov):
-    return jnp.block([[cov.last_pose, cov.cross], [cov.cross.T, cov.map]])
+    return jnp.block([[cov.pose, cov.cross], [cov.cross.T, cov.map]])
 
 
 def textbook(cov, rows):
@@ -54,23 +54,26 @@ def textbook(cov, rows):
 
 
 def ours(cov, rows):
-    done = kalman_update(blocks(cov), rows)
-    return done.shift, whole(done.cov), done.nis, done.logdet
+    result = kalman_update(blocks(cov), rows)
+    return result.shift, whole(result.cov), result.nis, result.logdet
 
 
 @pytest.mark.parametrize("large", [0, 10**6], ids=["zeros left out", "all at once"])
 @pytest.mark.parametrize("used", [M, 1, 0])
-def test_it_is_the_textbooks(used, large, monkeypatch):
+def test_the_update_equals_the_textbook(used, large, monkeypatch):
     monkeypatch.setattr(covariance, "LARGE_MAP", large)
     cov, rows = problem(used, used=used)
-    fresh = lambda *given: ours(*given)  # what was compiled before knows another number
-    for mine, theirs in zip(jax.jit(fresh)(cov, rows), textbook(cov, rows), strict=True):
+
+    def traced_anew(cov, rows):  # what was compiled before has another `LARGE_MAP`
+        return ours(cov, rows)
+
+    for mine, theirs in zip(jax.jit(traced_anew)(cov, rows), textbook(cov, rows), strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-10)
 
 
 @partial(jax.jit, static_argnums=0)
 def slopes(step, mix, cov, rows, slot):
-    """Derivative by covariance and rows of a mixture of all that conditioning gives, twice."""
+    """Derivative by covariance and rows of a mixture of all results of two updates."""
 
     def loss(cov, rows):
         # Symmetric, whatever the derivative is taken by.
@@ -89,21 +92,23 @@ def slopes(step, mix, cov, rows, slot):
 
 @pytest.mark.parametrize("part", range(5), ids=["shift", "cov", "nis", "log det", "all, twice"])
 @pytest.mark.parametrize("used", [M, 2])
-def test_its_derivative_is_the_textbooks(part, used):
+def test_the_derivative_equals_that_of_the_textbook(part, used):
     cov, rows = problem(10 + used, used=used)
     mix = jnp.ones((2, 4)) if part == 4 else jnp.zeros((2, 4)).at[0, part].set(1.0)
     # By leaves of floating point; the slots are integers.
     data = cov, rows._replace(slot=None), rows.slot
     mine, theirs = (slopes(step, mix, *data) for step in (ours, textbook))
-    # Padding: its residual and noise stand for nothing.
-    keep = np.arange(M) < used
-    cut = lambda s: (s[0], jax.tree.map(lambda x: x[keep], s[1]))
+    keep = np.arange(M) < used  # the residual and noise of padding mean nothing
+
+    def cut(gradient):
+        return gradient[0], jax.tree.map(lambda x: x[keep], gradient[1])
+
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9), cut(mine), cut(theirs)
     )
 
 
-def test_what_is_not_positive_definite_changes_nothing_and_its_neighbours_do_not_care():
+def test_an_update_that_is_not_positive_definite_changes_nothing_nor_its_neighbours():
     cov, rows = problem(3)
     bad = rows._replace(R=rows.R.at[1].set(-1e4 * jnp.eye(2)))
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), bad, rows)

@@ -1,4 +1,4 @@
-"""The filter with known association: a sensor that tells which landmark it sees."""
+"""The filter with known association: a sensor that identifies the landmarks."""
 
 from functools import partial
 
@@ -17,16 +17,9 @@ from jaxslam.filtering.belief import initial_belief
 from jaxslam.filtering.config import FilterConfig, init
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import features
-from jaxslam.pipeline.config import Config
 
 T, M, L = 80, 5, 12
-CONFIG = Config(
-    filter=FilterConfig(
-        max_landmarks=L,
-        max_updates=M,
-        max_new=M,
-    ),
-)
+CONFIG = FilterConfig(max_landmarks=L, max_updates=M, max_new=M)
 NOISE = NoiseParams.for_simulated_robot()._replace(
     range_std=jnp.array(0.1), bearing_std=jnp.array(0.03)
 )
@@ -36,112 +29,115 @@ Q = np.asarray(motion_model.odometry_cov(NOISE.odometry_coefficients, jnp.array(
 
 
 def drive(seed):
-    """True poses (T, 3), motions (T, 3), range and bearing (T, M, 2) and who it is (T, M), or -1.
+    """True poses (T, 3), odometry (T, 3), range and bearing (T, M, 2) and landmark (T, M), or -1.
 
     The nearest landmarks within 5 m, in any order, padded.
     """
     rng = np.random.default_rng(seed)
-    places = rng.uniform([-5.0, -2.0], [5.0, 9.0], (L, 2))
+    positions = rng.uniform([-5.0, -2.0], [5.0, 9.0], (L, 2))
     pose, poses = np.zeros(3), []
-    polar, who = np.zeros((T, M, 2)), np.full((T, M), -1, np.int32)
+    polar, ids = np.zeros((T, M, 2)), np.full((T, M), -1, np.int32)
     for t in range(T):
         if t:
             pose = reference_filter.compose(pose, rng.multivariate_normal(MOTION, Q))
         poses.append(pose)
-        away = np.hypot(*(places - pose[:2]).T)
-        near = rng.permutation(np.argsort(away)[: np.sum(away < 5.0)][: M - t % 2])
+        distance = np.hypot(*(positions - pose[:2]).T)
+        near = rng.permutation(np.argsort(distance)[: np.sum(distance < 5.0)][: M - t % 2])
         slot = rng.permutation(M)[: len(near)]
-        state = np.concatenate([pose, places.ravel()])
+        state = np.concatenate([pose, positions.ravel()])
         for k, i in zip(slot, near, strict=True):
             seen, _ = reference_filter.observe(state, i, JUNCTION)
-            polar[t, k], who[t, k] = seen + rng.normal(size=2) * [0.1, 0.03], i
-    told = np.where(np.arange(T)[:, None] > 0, MOTION, 0.0)
-    return np.stack(poses), told, polar, who
+            polar[t, k], ids[t, k] = seen + rng.normal(size=2) * [0.1, 0.03], i
+    odometry = np.where(np.arange(T)[:, None] > 0, MOTION, 0.0)
+    return np.stack(poses), odometry, polar, ids
 
 
-def inputs(told, polar, who):
-    seen = jax.vmap(features.features_from_range_bearing)(jnp.asarray(polar), jnp.asarray(who >= 0))
-    return Measurement(jnp.asarray(told), seen, jnp.asarray(who))
+def measurements_of(odometry, polar, ids):
+    seen = jax.vmap(features.features_from_range_bearing)(jnp.asarray(polar), jnp.asarray(ids >= 0))
+    return Measurement(jnp.asarray(odometry), seen, jnp.asarray(ids))
 
 
-def run(told, config=CONFIG):
-    return slam_filter.run_filter(config.filter, NOISE, init(config.filter, jnp.zeros(3)), told)
+def run(measurements, config=CONFIG):
+    return run_with(NOISE, measurements, config)
+
+
+def run_with(params, measurements, config=CONFIG):
+    return slam_filter.run_filter(config, params, init(config, jnp.zeros(3)), measurements)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_it_equals_dense_ekf_slam(seed):
-    poses, told, polar, who = drive(seed)
-    belief, info = run(inputs(told, polar, who))
+def test_known_association_equals_dense_ekf_slam(seed):
+    poses, odometry, polar, ids = drive(seed)
+    belief, info = run(measurements_of(odometry, polar, ids))
     dense, order = DenseSlam(np.zeros(3)), []
     for t in range(T):
-        dense.predict(told[t], Q if t else np.zeros((3, 3)))
-        old = [k for k in range(M) if who[t, k] in order]
+        dense.predict(odometry[t], Q if t else np.zeros((3, 3)))
+        old = [k for k in range(M) if ids[t, k] in order]
         if old:
             nis, logdet = dense.update(
-                [(order.index(who[t, k]), JUNCTION, polar[t, k], R) for k in old]
+                [(order.index(ids[t, k]), JUNCTION, polar[t, k], R) for k in old]
             )
             density = nis + logdet + 2 * len(old) * np.log(2 * np.pi)
             np.testing.assert_allclose(info.nis[t], nis, atol=1e-8)
             np.testing.assert_allclose(info.log_likelihood[t], -0.5 * density, atol=1e-8)
         for k in range(M):
-            if who[t, k] >= 0 and k not in old:
+            if ids[t, k] >= 0 and k not in old:
                 dense.augment(JUNCTION, polar[t, k], R)
-                order.append(who[t, k])
+                order.append(ids[t, k])
         np.testing.assert_allclose(info.pose[t], dense.mean[:3], atol=1e-9)
         np.testing.assert_allclose(info.pose_cov[t], dense.cov[:3, :3], atol=1e-10)
     rows = np.concatenate([np.arange(3), *[3 + 2 * i + np.arange(2) for i in order]])
     np.testing.assert_allclose(belief.mean[rows], dense.mean, atol=1e-9)
     np.testing.assert_allclose(belief.cov[np.ix_(rows, rows)], dense.cov, atol=1e-10)
-    np.testing.assert_array_equal(info.slot, np.where(who >= 0, who, L))
-    np.testing.assert_array_equal(info.id, who)
+    np.testing.assert_array_equal(info.slot, np.where(ids >= 0, ids, L))
+    np.testing.assert_array_equal(info.id, ids)
     assert len(order) >= 9 and np.hypot(*(info.pose[-1] - poses[-1])[:2]) < 0.5
 
 
-def test_a_landmark_told_twice_in_a_scan_counts_once():
-    _, told, polar, who = drive(0)
+def test_a_landmark_that_occurs_twice_in_a_scan_is_used_once():
+    _, odometry, polar, ids = drive(0)
     doubled = np.concatenate([polar, polar[:, :1] + 0.2], axis=1)
-    name = np.concatenate([who, who[:, :1]], axis=1)
-    config = CONFIG._replace(
-        filter=CONFIG.filter._replace(
-            max_updates=M + 1,
-            max_new=M + 1,
-        ),
-    )
-    once, twice = run(inputs(told, polar, who)), run(inputs(told, doubled, name), config)
+    doubled_ids = np.concatenate([ids, ids[:, :1]], axis=1)
+    config = CONFIG._replace(max_updates=M + 1, max_new=M + 1)
+    once = run(measurements_of(odometry, polar, ids))
+    twice = run(measurements_of(odometry, doubled, doubled_ids), config)
     np.testing.assert_allclose(once[0].mean, twice[0].mean, atol=1e-12)
     np.testing.assert_array_equal(once[0].num_seen, twice[0].num_seen)
 
 
 def test_features_without_a_known_landmark_are_invisible_in_values_and_gradients():
-    _, told, polar, who = drive(1)
-    junk = np.concatenate([polar, np.tile([[[2.0, 0.3], [3.0, 0.1]]], (T, 1, 1))], axis=1)
-    extra = np.tile(np.array([[-1, L]], np.int32), (T, 1))
+    _, odometry, polar, ids = drive(1)
+    extra_polar = np.tile([[[2.0, 0.3], [3.0, 0.1]]], (T, 1, 1))
+    extra_ids = np.tile(np.array([[-1, L]], np.int32), (T, 1))
 
+    @jax.jit  # where ids are not concrete, one that is out of range is left out
     @jax.value_and_grad
-    def loss(noise, told):
-        _, info = slam_filter.run_filter(
-            CONFIG.filter, noise, init(CONFIG.filter, jnp.zeros(3)), told
-        )
+    def loss(params, measurements):
+        _, info = run_with(params, measurements)
         return jnp.sum(info.pose[:, :2] ** 2)
 
-    told_junk = inputs(told, junk, np.concatenate([who, extra], axis=1))
-    told_junk = told_junk._replace(
-        features=told_junk.features._replace(valid=told_junk.features.valid.at[:, M:].set(True))
+    clean = measurements_of(odometry, polar, ids)
+    extra = measurements_of(
+        odometry,
+        np.concatenate([polar, extra_polar], axis=1),
+        np.concatenate([ids, extra_ids], axis=1),
     )
-    plain, with_junk = loss(NOISE, inputs(told, polar, who)), loss(NOISE, told_junk)
+    valid = extra.features.valid.at[:, M:].set(True)
+    extra = extra._replace(features=extra.features._replace(valid=valid))
+    plain, with_extra = loss(NOISE, clean), loss(NOISE, extra)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), plain, with_junk
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), plain, with_extra
     )
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(plain))
     assert np.abs(plain[1].range_std) > 0 and np.abs(plain[1].bearing_std) > 0
 
 
-def test_wrong_shapes_are_told():
-    _, told, polar, who = drive(0)
-    good = inputs(told, polar, who)
-    with pytest.raises(ValueError, match=r"inputs.known is int32 \(4,\), not"):
+def test_wrong_shapes_are_refused_by_name():
+    _, odometry, polar, ids = drive(0)
+    good = measurements_of(odometry, polar, ids)
+    with pytest.raises(ValueError, match=r"landmark_ids is int32 \(80, 4\), not"):
         run(good._replace(landmark_ids=good.landmark_ids[:, :4]))
-    with pytest.raises(ValueError, match=r"polar is .*\(5, 3\), not"):
+    with pytest.raises(ValueError, match=r" is .*\(5, 3\), not"):
         features.features_from_range_bearing(jnp.zeros((5, 3)), jnp.zeros(5, bool))
     with pytest.raises(ValueError, match="valid is .*, not"):
         features.features_from_range_bearing(jnp.zeros((5, 2)), jnp.zeros(4, bool))
@@ -151,25 +147,27 @@ def test_the_covariance_stays_positive_definite_over_50_000_steps_in_float32():
     steps, count, most = 50_000, 16, 4
     rng = np.random.default_rng(0)
     true = np.tile([0.25, 0.0, 0.05], (1, steps, 1))
-    truth = workload.driven(np.zeros((1, 3)), true)
+    truth = workload.dead_reckoning(np.zeros((1, 3)), true)
     angle = 2 * np.pi * np.arange(count) / count
-    places = rng.uniform(3, 7.5, (count, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
-    away, bearing, who = workload.nearest(truth, places[None] + [0, 5.0], (0.4, 6.0), most)
-    polar = np.stack([away, bearing], -1)[0] + rng.normal(size=(steps, most, 2)) * [0.1, 0.03]
-    told = true[0] + rng.normal(size=(steps, 3)) * [0.02, 0.02, 0.01]
-    who = np.where(polar[..., 0] > 0.4, who[0], -1)
+    positions = rng.uniform(3, 7.5, (count, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
+    distance, bearing, ids = workload.nearest(truth, positions[None] + [0, 5.0], (0.4, 6.0), most)
+    polar = np.stack([distance, bearing], -1)[0] + rng.normal(size=(steps, most, 2)) * [0.1, 0.03]
+    odometry = true[0] + rng.normal(size=(steps, 3)) * [0.02, 0.02, 0.01]
+    ids = np.where(polar[..., 0] > 0.4, ids[0], -1)
     q = jnp.diag(jnp.array([0.02, 0.02, 0.01], jnp.float32) ** 2)
     r = jnp.tile(jnp.diag(jnp.array([0.1, 0.03], jnp.float32) ** 2), (most, 1, 1))
 
-    def thousand(now, given):
-        step = lambda now, given: workload.step("invariant", q, now, (*given, r))
-        now, told = jax.lax.scan(step, now, given)
-        return now, (now.cov, told.last_pose, told.ok)
+    def step(belief, now):
+        return workload.step("invariant", q, belief, (*now, r))
 
-    given = jnp.asarray(told, jnp.float32), jnp.asarray(polar, jnp.float32), jnp.asarray(who)
-    given = jax.tree.map(lambda x: x.reshape((-1, 1000) + x.shape[1:]), given)
+    def thousand(belief, chunk):
+        belief, result = jax.lax.scan(step, belief, chunk)
+        return belief, (belief.cov, result.pose, result.ok)
+
+    data = jnp.asarray(odometry, jnp.float32), jnp.asarray(polar, jnp.float32), jnp.asarray(ids)
+    chunks = jax.tree.map(lambda x: x.reshape((-1, 1000) + x.shape[1:]), data)
     first = initial_belief(jnp.zeros(3, jnp.float32), max_landmarks=count)
-    _, (cov, pose, good) = jax.jit(partial(jax.lax.scan, thousand))(first, given)
+    _, (cov, pose, good) = jax.jit(partial(jax.lax.scan, thousand))(first, chunks)
     assert cov.dtype == jnp.float32 and good.all()
     cov = np.asarray(cov, float)
     np.testing.assert_allclose(cov, cov.swapaxes(1, 2), rtol=0, atol=1e-6)

@@ -15,24 +15,43 @@ from jaxslam.simulation.worlds import World
 
 SPEC = SegmentSpec()
 SMALL = Lidar(num_beams=61, angle_min=-math.pi / 3, angle_increment=math.pi / 90, range_std=0.01)
-SCANS, PRICE, STEEP = 24, SPEC.segment_cost, 10.0
-runs = jax.jit(segmentation.find_segments, static_argnums=(1, 2))
-cast = jax.jit(ray_casting.cast, static_argnums=2)
+SCANS, COST, MAX_INCIDENCE = 24, SPEC.segment_cost, 10.0
+find_segments = jax.jit(segmentation.find_segments, static_argnums=(0, 1))
+cast = jax.jit(ray_casting.cast, static_argnums=0)
 
 
 def angles(scanner):
     return scanner.angle_min + scanner.angle_increment * np.arange(scanner.num_beams)
 
 
-def cut(ranges, hit, breaks, *, lanes=16, price=PRICE, outlier=SPEC.outlier_cost, steep=STEEP):
-    """Where stretches begin (N, R), of scans of even walls."""
-    options = dict(price=price, outlier=outlier, lanes=lanes, steep=steep, uneven=0.0, grain=1.0)
+def partition(
+    ranges,
+    hit,
+    breaks,
+    *,
+    num_candidates=16,
+    segment_cost=COST,
+    outlier_cost=SPEC.outlier_cost,
+    max_incidence=MAX_INCIDENCE,
+):
+    """Where segments begin (N, R), of scans of even walls."""
 
     @jax.jit
     @jax.vmap
     def one(ranges, hit, breaks):
         scan = Scan(ranges, hit)
-        return line_fitting.partition_beams(SMALL, scan, breaks, 0.01, **options)
+        return line_fitting.partition_beams(
+            SMALL,
+            scan,
+            breaks,
+            0.01,
+            segment_cost=segment_cost,
+            outlier_cost=outlier_cost,
+            num_candidates=num_candidates,
+            roughness_std=0.0,
+            roughness_length=1.0,
+            max_incidence=max_incidence,
+        )
 
     return jax.tree.map(np.asarray, one(*map(jnp.asarray, (ranges, hit, breaks))))
 
@@ -61,8 +80,8 @@ def scans():
     return ranges, hit, breaks
 
 
-def misfits(ranges, steep=STEEP):
-    """Cost (R, R) of the stretch from one beam to another: of the line that fits it best.
+def line_costs(ranges, max_incidence=MAX_INCIDENCE):
+    """Cost (R, R) of the segment from one beam to another: of the line that fits it best.
 
     The inverse ranges are those of the line a cos(turn) + b sin(turn), turned to the first beam,
     with standard deviations that follow from those of the ranges, and b is about 0 beforehand.
@@ -73,7 +92,7 @@ def misfits(ranges, steep=STEEP):
         c, s = np.cos(turn[i:] - turn[i]), np.sin(turn[i:] - turn[i])
         rows = np.stack([c, s], axis=1) / (0.01 * q[i:] ** 2)[:, None]
         right = q[i:] / (0.01 * q[i:] ** 2)
-        rows = np.concatenate([[[0.0, 1 / (steep * q[i])]], rows])
+        rows = np.concatenate([[[0.0, 1 / (max_incidence * q[i])]], rows])
         right = np.append(0.0, right)
         for j in range(i, q.size):
             most = j - i + 2
@@ -82,80 +101,84 @@ def misfits(ranges, steep=STEEP):
     return cost
 
 
-def price_of(begins, misfit, price=PRICE):
-    """Cost of a cut (R,) bool."""
+def total_cost(begins, line_cost, segment_cost=COST):
+    """Cost of a partition (R,) bool."""
     first = np.flatnonzero(begins)
     last = np.append(first[1:], begins.size) - 1
-    return np.sum(misfit[first, last] + price)
+    return np.sum(line_cost[first, last] + segment_cost)
 
 
-def slow_cut(misfit, alone, price):
-    """The cut that costs least: the best of all first beams of the last stretch, and so on."""
+def slow_partition(line_cost, must_begin, segment_cost):
+    """The partition of least cost: the best of all first beams of the last segment, and so on."""
     best, first = [0.0], []
-    for j in range(len(alone)):
-        since = max(i for i in range(j + 1) if alone[i] or i == 0)
+    for j in range(len(must_begin)):
+        since = max(i for i in range(j + 1) if must_begin[i] or i == 0)
         starts = np.arange(since, j + 1)
-        cost = np.array(best)[starts] + price + misfit[starts, j]
+        cost = np.array(best)[starts] + segment_cost + line_cost[starts, j]
         best.append(cost.min())
         first.append(starts[np.argmin(cost)])
-    begins, last = np.zeros(len(alone), bool), len(alone) - 1
+    begins, last = np.zeros(len(must_begin), bool), len(must_begin) - 1
     while last >= 0:
         begins[first[last]] = True
         last = first[last] - 1
     return begins
 
 
-@pytest.mark.parametrize("price", [PRICE, 6.0])  # the second cuts into the noise
-def test_no_cut_costs_less_and_a_few_lanes_all_but_suffice(scans, price):
+@pytest.mark.parametrize("segment_cost", [COST, 6.0])  # the second splits noise
+def test_no_partition_costs_less_and_a_few_candidates_nearly_suffice(scans, segment_cost):
     ranges, hit, breaks = scans
     every, few = (
-        cut(*scans, lanes=n, price=price, outlier=np.inf).begins
+        partition(*scans, num_candidates=n, segment_cost=segment_cost, outlier_cost=np.inf).begins
         for n in (SMALL.num_beams, SPEC.num_candidates)
     )
     cheap = 0
-    for r, alone, ours, lean in zip(ranges, breaks | ~hit, every, few, strict=True):
-        misfit = misfits(r)
-        best = slow_cut(misfit, alone, price)
-        np.testing.assert_array_equal(ours, best)
+    for r, must_begin, optimal, lean in zip(ranges, breaks | ~hit, every, few, strict=True):
+        line_cost = line_costs(r)
+        best = slow_partition(line_cost, must_begin, segment_cost)
+        np.testing.assert_array_equal(optimal, best)
         assert 5 <= best.sum() < 30
-        excess = price_of(lean, misfit, price) - price_of(best, misfit, price)
+        least = total_cost(best, line_cost, segment_cost)
+        excess = total_cost(lean, line_cost, segment_cost) - least
         assert excess > -1e-6
         cheap += excess < 1e-6
     assert cheap >= 0.9 * SCANS
 
 
-def test_stretches_begin_at_breaks_and_hold_no_beam_without_return(scans):
+def test_segments_begin_at_breaks_and_hold_no_beam_without_return(scans):
     _, hit, breaks = scans
-    begins = cut(*scans).begins
+    begins = partition(*scans).begins
     assert begins[breaks].all() and begins[~hit].all()
     assert not begins[hit & ~breaks].all() and begins[hit & ~breaks].any()
     for k in range(SCANS):
-        spans = line_fitting.longest_intervals(
+        intervals = line_fitting.longest_intervals(
             jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40
         )
-        member = np.asarray(spans.interval_of_beam(SMALL.num_beams)) < 40
+        member = np.asarray(intervals.interval_of_beam(SMALL.num_beams)) < 40
         np.testing.assert_array_equal(member, hit[k])
 
 
-def test_the_mirrored_scan_is_cut_at_the_mirrored_beams(scans):
+def test_the_mirrored_scan_is_split_at_the_mirrored_beams(scans):
     """Up to ties: of a few beams those in the middle may go with either side, at equal cost."""
     ranges, hit, breaks = scans
     turned = breaks.copy()
     turned[:, 1:] = breaks[:, :0:-1]  # before a beam is after it
     back_to_front = ranges[:, ::-1], hit[:, ::-1], turned
     here, there = (
-        cut(*scan, lanes=SMALL.num_beams, outlier=np.inf, steep=1e3).begins
+        partition(
+            *scan, num_candidates=SMALL.num_beams, outlier_cost=np.inf, max_incidence=1e3
+        ).begins
         for scan in (scans, back_to_front)
     )
     back = np.ones_like(there)
     back[:, 1:] = there[:, :0:-1]
     assert np.mean(np.all(here == back, axis=1)) >= 0.7
     for k in range(SCANS):
-        misfit = misfits(ranges[k], steep=1e3)
-        np.testing.assert_allclose(price_of(here[k], misfit), price_of(back[k], misfit), atol=1e-3)
+        line_cost = line_costs(ranges[k], max_incidence=1e3)
+        costs = [total_cost(begins[k], line_cost) for begins in (here, back)]
+        np.testing.assert_allclose(*costs, atol=1e-3)
 
 
-def test_a_beam_that_strays_does_not_cut_a_wall():
+def test_an_outlier_does_not_split_a_wall():
     """Nor does it move it."""
     turn, beams = angles(SMALL), np.arange(3, 58, 3)
     wall = 2.0 / np.cos(turn - 0.2)
@@ -163,28 +186,30 @@ def test_a_beam_that_strays_does_not_cut_a_wall():
     ranges += 0.005 * np.random.default_rng(0).normal(size=ranges.shape)
     clean, hit, breaks = ranges.copy(), ranges > 0, np.tile(np.arange(61) == 0, (len(beams), 1))
     ranges[np.arange(len(beams)), beams] += 0.15
-    strayed, straight = cut(ranges, hit, breaks), cut(clean, hit, breaks)
-    np.testing.assert_array_equal(strayed.begins, breaks)
+    disturbed, straight = partition(ranges, hit, breaks), partition(clean, hit, breaks)
+    np.testing.assert_array_equal(disturbed.begins, breaks)
     np.testing.assert_array_equal(straight.begins, breaks)
-    np.testing.assert_allclose(strayed.normal[:, -1], straight.normal[:, -1], atol=0.01)
+    np.testing.assert_allclose(disturbed.normal[:, -1], straight.normal[:, -1], atol=0.01)
     np.testing.assert_allclose(straight.normal[:, -1, 0], math.cos(0.2), atol=0.01)
-    assert (cut(ranges, hit, breaks, outlier=np.inf).begins.sum(axis=1) >= 3).all()
+    without_outliers = partition(ranges, hit, breaks, outlier_cost=np.inf)
+    assert (without_outliers.begins.sum(axis=1) >= 3).all()
 
 
 @pytest.mark.parametrize("ranges", [0.0, SMALL.range_max])
-def test_a_scan_without_returns_has_no_runs_and_finite_numbers(ranges):
+def test_a_scan_without_returns_has_no_segments_and_finite_numbers(ranges):
     nothing = Scan(jnp.full(61, ranges), jnp.zeros(61, bool))
-    parts = cut(nothing.ranges[None], nothing.hit[None], nothing.hit[None])
+    parts = partition(nothing.ranges[None], nothing.hit[None], nothing.hit[None])
     assert parts.begins.all() and np.isfinite(parts.normal).all()
-    spans = line_fitting.longest_intervals(jnp.asarray(parts.begins[0]), nothing.hit, capacity=5)
-    assert spans.first.tolist() == [NO_BEAM] * 5 and spans.last.tolist() == [-1] * 5
-    found = runs(nothing, SMALL, SPEC)
-    assert not found.valid.any() and not found.meets.any()
+    begins = jnp.asarray(parts.begins[0])
+    intervals = line_fitting.longest_intervals(begins, nothing.hit, capacity=5)
+    assert intervals.first.tolist() == [NO_BEAM] * 5 and intervals.last.tolist() == [-1] * 5
+    found = find_segments(SMALL, SPEC, nothing)
+    assert not found.valid.any() and not found.meets_next.any()
     assert all(np.isfinite(np.asarray(field, float)).all() for field in found)
 
 
 @pytest.mark.parametrize("noise, step", [(0.01, 1.0), (0.03, 0.5)])
-def test_a_straight_noisy_wall_is_one_run(noise, step):
+def test_a_straight_noisy_wall_is_one_segment(noise, step):
     beams = int(100 / step) + 1
     scanner = Lidar(
         num_beams=beams,
@@ -193,17 +218,19 @@ def test_a_straight_noisy_wall_is_one_run(noise, step):
         range_std=noise,
     )
     walls = World(jnp.array([[2.0, -9.0, 2.0, 9.0]]))
-    clean = cast(walls, jnp.zeros(3), scanner)
+    clean = cast(scanner, walls, jnp.zeros(3))
     keys = jax.random.split(jax.random.key(0), 200)
-    one = lambda key: segmentation.find_segments(
-        scanner, SPEC, ray_casting.add_range_noise(key, scanner, clean)
-    ).valid.sum()
-    count = np.asarray(jax.jit(jax.vmap(one))(keys))
+
+    def number(key):
+        noisy = ray_casting.add_range_noise(key, scanner, clean)
+        return segmentation.find_segments(scanner, SPEC, noisy).valid.sum()
+
+    count = np.asarray(jax.jit(jax.vmap(number))(keys))
     assert np.mean(count == 1) >= 0.98, np.bincount(count)
 
 
-def test_a_wall_that_steps_by_a_few_centimetres_is_one_run():
-    """Seen from near and at a grazing angle, whatever the noise; but not if held for even."""
+def test_a_wall_that_steps_by_a_few_centimetres_is_one_segment():
+    """Seen from near and at a grazing angle, whatever the noise; but not without the roughness."""
     walls = World(jnp.asarray(worlds.named("fig06d").walls))
     random, poses = np.random.default_rng(0), np.zeros((60, 3))
     poses[:, 0], poses[:, 1] = random.uniform(0.0, 2.5, 60), random.uniform(-0.6, 0.6, 60)
@@ -220,29 +247,29 @@ def test_a_wall_that_steps_by_a_few_centimetres_is_one_run():
         return np.asarray(many(keys, jnp.asarray(poses)))
 
     for noise in (0.0, 0.03):
-        ours = counts(SPEC, noise)
-        assert np.mean(ours == 2) >= 0.7 and ours.max() <= 4, np.bincount(ours)
-    cut_up = counts(SPEC._replace(roughness_std=1e-4), 0.0)
-    assert np.mean(cut_up > 4) >= 0.9, np.bincount(cut_up)
+        found = counts(SPEC, noise)
+        assert np.mean(found == 2) >= 0.7 and found.max() <= 4, np.bincount(found)
+    split = counts(SPEC._replace(roughness_std=1e-4), 0.0)
+    assert np.mean(split > 4) >= 0.9, np.bincount(split)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_a_corner_is_put_at_its_beam(noise):
+def test_a_scan_is_split_at_the_beam_of_a_corner(noise):
     scanner = Lidar(
         num_beams=181, angle_min=-math.pi / 4, angle_increment=math.pi / 360, range_std=0.01
     )
     walls = World(jnp.asarray(worlds.polyline([(3.0, -9.0), (3.0, 1.0), (-2.0, 1.0)])))
-    scan = cast(walls, jnp.zeros(3), scanner)
+    scan = cast(scanner, walls, jnp.zeros(3))
     if noise:
         scan = ray_casting.add_range_noise(jax.random.key(1), scanner, scan)
-    of = np.asarray(runs(scan, scanner, SPEC).segment_of_beam)
+    of = np.asarray(find_segments(scanner, SPEC, scan).segment_of_beam)
     beam = (math.atan2(1.0, 3.0) - scanner.angle_min) / scanner.angle_increment  # 126.9
     np.testing.assert_allclose(np.flatnonzero(np.diff(of)) + 0.5, beam, atol=1.5 if noise else 0.5)
     assert of[0] == 0 and of[-1] == 1
 
 
-def pairs_of(spans):
-    pairs = zip(spans.first.tolist(), spans.last_seen.tolist(), strict=True)
+def pairs_of(intervals):
+    pairs = zip(intervals.first.tolist(), intervals.last.tolist(), strict=True)
     return [(a, b) for a, b in pairs if b >= 0]
 
 

@@ -15,14 +15,13 @@ from jaxslam.frontend.segments import SegmentSpec
 from jaxslam.simulation import ray_casting, worlds
 from jaxslam.simulation.worlds import World
 
-runs = jax.jit(segmentation.find_segments, static_argnums=(1, 2))
-run_cells = jax.jit(segments.segment_cells, static_argnums=(1, 3))
-cast = jax.jit(ray_casting.cast, static_argnums=2)
+find_segments = jax.jit(segmentation.find_segments, static_argnums=(0, 1))
+segment_cells = jax.jit(segments.segment_cells, static_argnums=(0, 1))
+cast = jax.jit(ray_casting.cast, static_argnums=0)
 
 SCANNER, SPEC = Lidar(), SegmentSpec()
-TINY = GridSpec(
-    cell_size=0.1, x_max=0.5, x_min=0.0, y_half=0.5
-)  # the axis is between columns 4 and 5
+# The axis of the sensor is between columns 4 and 5.
+TINY = GridSpec(cell_size=0.1, x_max=0.5, x_min=0.0, y_half=0.5)
 RIGHT, LEFT = (2, 2), (2, 7)  # cells on the clockwise and on the other side of the axis
 TURN = {1: (1, 0), 2: (0, -1), 4: (-1, 0), 8: (0, 1)}  # N E S W: x is ahead, y to the left
 
@@ -57,14 +56,14 @@ def drawn(cell, pattern):
 
 
 def seen(walls, pose, scanner=SCANNER):
-    """Noise-free scan of walls (S, 4) from a pose, and its runs."""
-    scan = cast(World(jnp.asarray(walls)), jnp.asarray(pose, float), scanner)
-    return scan, runs(scan, scanner, SPEC)
+    """Noise-free scan of walls (S, 4) from a pose, and its segments."""
+    scan = cast(scanner, World(jnp.asarray(walls)), jnp.asarray(pose, float))
+    return scan, find_segments(scanner, SPEC, scan)
 
 
-def comb(chunks):
+def comb(pieces):
     """Scan in which the range jumps after each of the given numbers of beams."""
-    ranges = np.concatenate([np.full(n, 2.0 + 2.0 * (k % 2)) for k, n in enumerate(chunks)])
+    ranges = np.concatenate([np.full(n, 2.0 + 2.0 * (k % 2)) for k, n in enumerate(pieces)])
     scanner = Lidar(num_beams=len(ranges), angle_increment=math.pi / 360, angle_min=-1.8)
     return Scan(ranges=jnp.asarray(ranges), hit=jnp.ones(len(ranges), bool)), scanner
 
@@ -111,33 +110,33 @@ def test_a_room_gives_exactly_its_visible_walls(pose):
         np.testing.assert_allclose(off, 0.0, atol=1e-9)
     assert np.all(np.sum(normal * -centre, axis=1) > 0)  # the robot is on the positive side
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
-    np.testing.assert_array_equal(found.meets[:4], [True, True, False, False])
+    np.testing.assert_array_equal(found.meets_next[:4], [True, True, False, False])
     np.testing.assert_allclose(ends[:2, 1], at[1:3], atol=1e-9)
     np.testing.assert_allclose(ends[1:, 0], at[1:3], atol=1e-9)
-    assert found.real[:3].tolist() == [[False, True], [True, True], [True, False]]
+    assert found.end_is_real[:3].tolist() == [[False, True], [True, True], [True, False]]
 
 
 @pytest.mark.parametrize("heading", np.linspace(-0.6, 0.6, 7).round(2))
-def test_a_straight_wall_is_one_run_whatever_its_direction(heading):
+def test_a_straight_wall_is_one_segment_whatever_its_direction(heading):
     scan, found = seen([[2.0, -9.0, 2.0, 9.0]], (0.0, 0.0, heading))
     assert found.valid.sum() == 1
-    assert np.unique(np.asarray(found.of_beam)[np.asarray(scan.hit)]).tolist() == [0]
+    assert np.unique(np.asarray(found.segment_of_beam)[np.asarray(scan.hit)]).tolist() == [0]
     np.testing.assert_allclose(found.normal[0], [-math.cos(heading), math.sin(heading)], atol=1e-9)
 
 
-def test_beams_of_a_run_lie_on_its_line():
-    """But for a single beam beside it, at its end, which is cheaper as stray than as a run."""
+def test_beams_of_a_segment_lie_on_its_line():
+    """But for one beam at its end, which is cheaper as an outlier than as a segment."""
     scan, found = seen(worlds.named("office").walls, (8.1, 5.03, 1.9))
-    of, valid = np.asarray(found.of_beam), np.asarray(found.valid)
+    of, valid = np.asarray(found.segment_of_beam), np.asarray(found.valid)
     owned = np.flatnonzero((of < SPEC.max_segments) & valid[np.minimum(of, SPEC.max_segments - 1)])
     k = of[owned]
     off = np.asarray(beam_ends(SCANNER, scan))[owned] - np.asarray(found.centre)[k]
     off = np.abs(np.sum(off * np.asarray(found.normal)[k], axis=1))
     assert valid.sum() > 5 and np.median(off) < 1e-9
-    stray = off > math.sqrt(SPEC.outlier_cost) * SCANNER.range_std / 2
-    assert np.bincount(k[stray]).max(initial=0) <= 1 and stray.sum() < 0.02 * stray.size
+    outlier = off > math.sqrt(SPEC.outlier_cost) * SCANNER.range_std / 2
+    assert np.bincount(k[outlier]).max(initial=0) <= 1 and outlier.sum() < 0.02 * outlier.size
     ends = (of != np.roll(of, 1)) | (of != np.roll(of, -1))
-    assert ends[owned[stray]].all()
+    assert ends[owned[outlier]].all()
 
 
 def test_the_line_fit_is_as_uncertain_as_it_says():
@@ -146,8 +145,8 @@ def test_the_line_fit_is_as_uncertain_as_it_says():
     scanner = Lidar(
         num_beams=81, angle_min=-math.pi / 9, angle_increment=math.pi / 360, range_std=0.01
     )
-    clean = cast(World(jnp.array([[2.0, -9.0, 2.0, 9.0]])), jnp.zeros(3), scanner)
-    places = jnp.array([-0.6, 0.0, 0.6])  # [m] along the wall, from its middle
+    clean = cast(scanner, World(jnp.array([[2.0, -9.0, 2.0, 9.0]])), jnp.zeros(3))
+    offsets = jnp.array([-0.6, 0.0, 0.6])  # [m] along the wall, from its middle
 
     @jax.jit
     @jax.vmap
@@ -158,9 +157,9 @@ def test_the_line_fit_is_as_uncertain_as_it_says():
         line = jax.tree.map(
             lambda x: x[0], found._replace(segment_of_beam=found.segment_of_beam[:1])
         )
-        at = jnp.stack([jnp.full(3, 2.0), places], axis=-1) - line.centre[None]
+        at = jnp.stack([jnp.full(3, 2.0), offsets], axis=-1) - line.centre[None]
         along = at @ jnp.stack([line.normal[1], -line.normal[0]])
-        return at @ line.normal, line.line_variance(along), found.valid.sum(), line.count
+        return at @ line.normal, line.line_variance(along), found.valid.sum(), line.num_beams
 
     error, claimed, number, beams = trial(jax.random.split(jax.random.key(0), count))
     alone = np.asarray(number) == 1
@@ -171,46 +170,52 @@ def test_the_line_fit_is_as_uncertain_as_it_says():
     assert np.all(bias < 4 / math.sqrt(alone.sum()))
 
 
-def test_more_stretches_than_runs_share_one_label():
-    chunks = [5 + k % 4 for k in range(SPEC.max_segments + 20)]
-    scan, scanner = comb(chunks)
-    found = runs(scan, scanner, SPEC)
-    of = np.asarray(found.of_beam)
-    stretch = np.repeat(np.arange(len(chunks)), chunks)
-    # Every beam that hit has a label, and all but one label belong to one stretch each.
-    owner = {k: set(stretch[of == k]) for k in range(SPEC.max_segments)}
+def test_surplus_pieces_share_one_segment():
+    pieces = [5 + k % 4 for k in range(SPEC.max_segments + 20)]
+    scan, scanner = comb(pieces)
+    found = find_segments(scanner, SPEC, scan)
+    of = np.asarray(found.segment_of_beam)
+    piece = np.repeat(np.arange(len(pieces)), pieces)
+    # Every beam that hit has a segment, and all but one segment hold one piece each.
+    owner = {k: set(piece[of == k]) for k in range(SPEC.max_segments)}
     shared = max(owner, key=lambda k: len(owner[k]))
     assert of.max() == SPEC.max_segments - 1 and len(owner[shared]) == 21
     assert all(len(owner[k]) == 1 for k in owner if k != shared)
-    # The longest stretches have their own.
-    own = [chunks[next(iter(owner[k]))] for k in owner if k != shared]
-    assert min(own) >= max(chunks[k] for k in owner[shared])
+    # The longest pieces have their own.
+    own = [pieces[next(iter(owner[k]))] for k in owner if k != shared]
+    assert min(own) >= max(pieces[k] for k in owner[shared])
     # No line goes through all that share it.
     np.testing.assert_array_equal(found.valid, np.arange(SPEC.max_segments) != shared)
 
 
-def test_every_hit_lies_on_a_cell_of_its_run_even_when_runs_share_a_number():
+def test_every_hit_lies_on_a_cell_of_its_segment_even_where_pieces_share_one():
     scan, scanner = comb([5 + k % 4 for k in range(SPEC.max_segments + 20)])
-    found = runs(scan, scanner, SPEC)
+    found = find_segments(scanner, SPEC, scan)
     spec = GridSpec(x_max=5.0, x_min=-5.0, y_half=5.0)
-    drawn = np.asarray(run_cells(scan, scanner, found, spec))
-    at, of = np.asarray(cell_of(spec, beam_ends(scanner, scan))), np.asarray(found.of_beam)
+    drawn = np.asarray(segment_cells(scanner, spec, scan, found))
+    at, of = np.asarray(cell_of(spec, beam_ends(scanner, scan))), np.asarray(found.segment_of_beam)
     here = drawn[tuple(at.T)]
-    assert (here >= of).all()  # where two runs share a cell, the later has it
+    assert (here >= of).all()  # where two segments share a cell, the later has it
     assert np.mean(here == of) > 0.9
     assert drawn.dtype == np.int8 and drawn.min() == -1 and drawn.max() == of.max()
 
 
-def test_beams_that_hit_nothing_draw_no_run():
+def test_beams_without_return_draw_no_segment():
     nothing = Scan(ranges=jnp.full(361, 10.0), hit=jnp.zeros(361, bool))
-    found = runs(nothing, SCANNER, SPEC)
-    assert not found.valid.any() and np.all(found.of_beam == SPEC.max_segments)
-    np.testing.assert_array_equal(run_cells(nothing, SCANNER, found, GridSpec()), -1)
+    found = find_segments(SCANNER, SPEC, nothing)
+    assert not found.valid.any() and np.all(found.segment_of_beam == SPEC.max_segments)
+    np.testing.assert_array_equal(segment_cells(SCANNER, GridSpec(), nothing, found), -1)
 
 
-def test_cells_of_a_run_have_no_gaps():
+def test_cells_of_a_segment_have_no_gaps():
     scan, found = seen([[0.5, 0.5, 6.0, 0.5]], (0.0, 0.0, 0.0))  # grazing: hits far apart
-    drawn = np.asarray(run_cells(scan, SCANNER, found, GridSpec()))
+    drawn = np.asarray(segment_cells(SCANNER, GridSpec(), scan, found))
     rows = np.flatnonzero((drawn >= 0).any(axis=1))
     assert np.all(np.diff(rows) == 1) and rows[-1] - rows[0] > 50
     assert set(drawn.ravel()) == {-1, 0}
+
+
+def test_edge_codes_want_the_grid_of_their_spec():
+    cells = jnp.zeros((4, 5), bool)
+    with pytest.raises(ValueError, match=r"grid.occupied is bool \(4, 5\), not bool \(82, 160\)"):
+        jax.eval_shape(lambda: edge_codes(GridSpec(), Grid(cells, cells)))

@@ -1,3 +1,5 @@
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,11 +7,11 @@ import pytest
 
 from jaxslam.frontend import automaton, tiled_automaton
 
-FAR = 400  # more steps than any front needs on the grids below
+MANY = 400  # more steps than any front needs on the grids below
 
 
 def scene(seed, shape, dtype=np.uint16, sources=0.01, walls=0.2):
-    """Sources of a few labels, some of two, and closed cells, strewn over a grid."""
+    """Random sources of a few labels, some of two, and free cells."""
     random = np.random.default_rng(seed)
     bits = (1 << random.integers(0, 6, shape)) | (1 << random.integers(0, 6, shape))
     bits = np.where(random.random(shape) < 0.8, bits & -bits, bits)
@@ -19,21 +21,21 @@ def scene(seed, shape, dtype=np.uint16, sources=0.01, walls=0.2):
 
 def serpentine(size, pitch):
     """A grid that is one long corridor, with a source of its own at either end."""
-    open = np.zeros((size, size), bool)
-    open[1:-1, 1:-1] = True
+    free = np.zeros((size, size), bool)
+    free[1:-1, 1:-1] = True
     for k, i in enumerate(range(pitch, size - 1, pitch)):
-        open[i, 1:-1] = False
-        open[i, 1 if k % 2 else -2] = True
+        free[i, 1:-1] = False
+        free[i, 1 if k % 2 else -2] = True
     bits = np.zeros((size, size), np.uint8)
     bits[1, 1], bits[-2, -2] = 1, 2
-    return bits, open
+    return bits, free
 
 
-def check(bits, open, steps, **sizes):
+def check(bits, free, steps, **sizes):
     """The same cell for cell, in tiles and at once."""
-    found = tiled_automaton.expand_tiled(bits, open, steps=steps, **sizes)
-    whole = FAR if steps is None else steps
-    expected = automaton.expand(jnp.asarray(bits), jnp.asarray(open), steps=whole)
+    found = tiled_automaton.expand_tiled(bits, free, steps=steps, **sizes)
+    num_steps = MANY if steps is None else steps
+    expected = automaton.expand(jnp.asarray(bits), jnp.asarray(free), steps=num_steps)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
     assert found.labels.dtype == bits.dtype and found.arrival.dtype == np.int32
     return expected
@@ -61,25 +63,34 @@ def test_tiles_of_several_batches_all_advance():
 
 
 def test_only_tiles_that_may_change_are_worked_on(monkeypatch):
-    bits, open = np.zeros((2, 160, 160), np.uint8)
-    bits[20, 20], open[16:32, :] = 1, 1
+    bits, free = np.zeros((2, 160, 160), np.uint8)
+    bits[20, 20], free[16:32, :] = 1, 1
     worked, plain = [], tiled_automaton._advance
 
-    def counted(cells, may, active, tile, halo):
+    def counted(cells, is_free, active, tile, halo):
         worked.append(len(active))
-        return plain(cells, may, active, tile, halo)
+        return plain(cells, is_free, active, tile, halo)
 
     monkeypatch.setattr(tiled_automaton, "_advance", counted)
-    check(bits, open.astype(bool), None, tile=16, halo=16)
-    assert worked[0] == 10 and max(worked[1:]) <= 4  # the open row of tiles, then its front
+    check(bits, free.astype(bool), None, tile=16, halo=16)
+    assert worked[0] == 10 and max(worked[1:]) <= 4  # the free row of tiles, then its front
     assert len(worked) < 12
 
 
+LABELS, FREE = np.zeros((3, 3), np.uint8), np.ones((3, 3), bool)
+
+
 @pytest.mark.parametrize(
-    "change",
-    [{"open": np.ones((3, 4), bool)}, {"tile": 4, "halo": 5}, {"halo": 0}, {"steps": -1}],
+    "call, message",
+    [
+        (lambda: tiled_automaton.expand_tiled(LABELS, FREE[1:]), "free is bool (2, 3), not bool"),
+        (lambda: tiled_automaton.expand_tiled(LABELS, LABELS), "free is uint8 (3, 3), not bool"),
+        (lambda: tiled_automaton.expand_tiled(FREE, FREE), "labels is bool (3, 3), not unsigned"),
+        (lambda: tiled_automaton.expand_tiled(LABELS, FREE, tile=4, halo=5), "halo 5 is not"),
+        (lambda: tiled_automaton.expand_tiled(LABELS, FREE, halo=0), "halo 0 is not between 1"),
+        (lambda: tiled_automaton.expand_tiled(LABELS, FREE, steps=-1), "steps is -1, not 0 or"),
+    ],
 )
-def test_bad_arguments_are_refused(change):
-    given = {"labels": np.zeros((3, 3), np.uint8), "open": np.ones((3, 3), bool)} | change
-    with pytest.raises(ValueError):
-        tiled_automaton.expand_tiled(**given)
+def test_bad_arguments_are_refused(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()

@@ -9,14 +9,14 @@ from scipy.ndimage import distance_transform_cdt
 
 from jaxslam.frontend.automaton import (
     EMPTY,
-    SHUT,
+    FROZEN,
     Diagram,
-    diagram_of_fronts,
+    decode,
+    encode_sources,
     expand,
-    expand_fronts,
-    initial_fronts,
+    expand_encoded,
 )
-from jaxslam.frontend.voronoi import branch_cells, junction_cells, junction_cells_of_fronts
+from jaxslam.frontend.voronoi import branch_cells, encoded_junction_cells, junction_cells
 
 STEPS = 60  # more than any front needs on the grids below
 SEEDS = range(4)
@@ -36,15 +36,15 @@ TWO = [
 
 
 def random_grid(seed, shape=(20, 27), labels=5, walls=0.15, dtype=np.uint8):
-    """Sources of a few labels, and closed cells, strewn over a grid."""
+    """Random sources of a few labels, and free cells."""
     random = np.random.default_rng(seed)
     sources = random.random(shape) < 0.04
     bits = np.where(sources, 1 << random.integers(0, labels, shape), 0).astype(dtype)
     return bits, random.random(shape) > walls
 
 
-def grown(bits, open, steps=STEPS, octagon=False):
-    diagram = expand(jnp.asarray(bits), jnp.asarray(open), steps=steps, octagon=octagon)
+def grown(bits, free, steps=STEPS, octagon=False):
+    diagram = expand(jnp.asarray(bits), jnp.asarray(free), steps=steps, octagon=octagon)
     return jax.tree.map(np.asarray, diagram)
 
 
@@ -62,9 +62,11 @@ def cells_of(rows, width):
 
 def printed(diagram):
     """What the figure prints of each cell: arrival and label, or nothing."""
-    text = lambda t, v: f"{t},{v}" if reference.bits(v) == 1 else ""
-    pairs = zip(diagram.arrival.tolist(), diagram.labels.tolist(), strict=True)
-    return [[text(t, v) for t, v in zip(*row, strict=True)] for row in pairs]
+    rows = zip(diagram.arrival.tolist(), diagram.labels.tolist(), strict=True)
+    return [
+        [f"{t},{v}" if reference.bits(v) == 1 else "" for t, v in zip(*row, strict=True)]
+        for row in rows
+    ]
 
 
 def test_one_source_grows_as_figure_2a():
@@ -91,9 +93,9 @@ def test_two_sources_meet_as_in_figure_2b():
 @pytest.mark.parametrize("steps", [0, 1, 5, STEPS])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_expand_agrees_with_breadth_first_search(seed, steps):
-    bits, open = random_grid(seed)
-    diagram = grown(bits, open, steps)
-    labels, arrival = reference.expand(bits, open, steps)
+    bits, free = random_grid(seed)
+    diagram = grown(bits, free, steps)
+    labels, arrival = reference.expand(bits, free, steps)
     np.testing.assert_array_equal(diagram.labels, labels)
     np.testing.assert_array_equal(diagram.arrival, arrival)
     assert reference.bits(diagram.labels.max()) > 1 or steps < 5  # fronts did meet
@@ -101,12 +103,12 @@ def test_expand_agrees_with_breadth_first_search(seed, steps):
 
 @pytest.mark.parametrize("dtype, labels", [(np.uint8, 8), (np.uint16, 16), (np.uint32, 32)])
 def test_every_label_that_fits_expands(dtype, labels):
-    bits, open = random_grid(7, dtype=dtype, shape=(30, 30))
+    bits, free = random_grid(7, dtype=dtype, shape=(30, 30))
     bits[bits != 0] = 2 ** (np.arange(np.count_nonzero(bits)) % labels)
-    diagram = grown(bits, open)
+    diagram = grown(bits, free)
     assert diagram.labels.dtype == dtype
     assert np.bitwise_or.reduce(diagram.labels, axis=None) == 2**labels - 1
-    np.testing.assert_array_equal(diagram.labels, reference.expand(bits, open, STEPS)[0])
+    np.testing.assert_array_equal(diagram.labels, reference.expand(bits, free, STEPS)[0])
 
 
 def test_sources_of_two_labels_pass_nothing_on():
@@ -130,8 +132,8 @@ def test_arrival_is_the_manhattan_distance_to_the_nearest_source(seed):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("turn", [np.rot90, np.flipud, np.fliplr, np.transpose])
 def test_expand_turns_and_mirrors_with_the_grid(turn, seed):
-    bits, open = random_grid(seed)
-    before, after = grown(bits, open), grown(turn(bits), turn(open))
+    bits, free = random_grid(seed)
+    before, after = grown(bits, free), grown(turn(bits), turn(free))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, turn(b)), after, before)
     found = junction_cells(before, bits != 0)
     np.testing.assert_array_equal(junction_cells(after, turn(bits) != 0), turn(found))
@@ -139,9 +141,9 @@ def test_expand_turns_and_mirrors_with_the_grid(turn, seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_names_of_the_labels_do_not_matter(seed):
-    bits, open = random_grid(seed)
+    bits, free = random_grid(seed)
     order = np.random.default_rng(seed + 100).permutation(5)
-    before, after = grown(bits, open), grown(permuted(bits, order), open)
+    before, after = grown(bits, free), grown(permuted(bits, order), free)
     np.testing.assert_array_equal(after.labels, permuted(before.labels, order))
     np.testing.assert_array_equal(after.arrival, before.arrival)
     found = junction_cells(before, bits != 0)
@@ -150,21 +152,21 @@ def test_names_of_the_labels_do_not_matter(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_closed_cells_never_change_and_padding_is_invisible(seed):
-    bits, open = random_grid(seed)
-    diagram = grown(bits, open)
-    shut = ~open & (bits == 0)
-    assert not diagram.labels[shut].any() and (diagram.arrival[shut] == -1).all()
-    padded = grown(np.pad(bits, 3), np.pad(open, 3))
+def test_cells_that_are_not_free_never_change_and_padding_is_invisible(seed):
+    bits, free = random_grid(seed)
+    diagram = grown(bits, free)
+    barred = ~free & (bits == 0)
+    assert not diagram.labels[barred].any() and (diagram.arrival[barred] == -1).all()
+    padded = grown(np.pad(bits, 3), np.pad(free, 3))
     inner = jax.tree.map(lambda x: x[3:-3, 3:-3], padded)
     jax.tree.map(np.testing.assert_array_equal, inner, diagram)
     assert padded.labels.astype(bool).sum() == diagram.labels.astype(bool).sum()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_two_regions_are_parted_by_branches(seed):
-    bits, open = random_grid(seed)
-    diagram, sources = grown(bits, open), bits != 0
+def test_branches_separate_every_two_regions(seed):
+    bits, free = random_grid(seed)
+    diagram, sources = grown(bits, free), bits != 0
     branch = np.asarray(branch_cells(diagram, sources))
     assert not reference.unseparated(diagram.labels, branch, sources)
     assert reference.unseparated(diagram.labels, np.zeros_like(branch), sources)  # they do meet
@@ -181,30 +183,30 @@ def test_an_even_meet_is_marked_on_one_side_only():
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_junctions_are_where_three_labels_are_near(seed):
-    bits, open = random_grid(seed)
-    diagram = grown(bits, open)
+    bits, free = random_grid(seed)
+    diagram = grown(bits, free)
     expected = reference.junctions(diagram.labels, bits != 0)
     np.testing.assert_array_equal(junction_cells(diagram, bits != 0), expected)
     assert 0 < expected.sum() < expected.size / 2
 
 
 def test_expand_batches():
-    bits, open = (np.stack(x) for x in zip(*map(random_grid, SEEDS), strict=True))
-    together = jax.vmap(lambda b, o: expand(b, o, steps=STEPS))(bits, open)
+    bits, free = (np.stack(x) for x in zip(*map(random_grid, SEEDS), strict=True))
+    together = jax.vmap(lambda b, o: expand(b, o, steps=STEPS))(bits, free)
     for k in SEEDS:
-        alone = grown(bits[k], open[k])
+        alone = grown(bits[k], free[k])
         jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), together, alone)
 
 
-def test_expand_batches_in_two_levels_and_with_one_open_for_all():
+def test_expand_batches_in_two_levels_with_free_cells_in_common():
     bits = np.stack([random_grid(seed)[0] for seed in SEEDS])
-    open = random_grid(0)[1]
-    over = lambda b: jax.vmap(lambda one: expand(one, open, steps=STEPS))(b)
-    together = jax.vmap(over)(bits.reshape(2, 2, *open.shape))
+    free = random_grid(0)[1]
+    of_row = jax.vmap(lambda own: expand(own, free, steps=STEPS))
+    together = jax.vmap(of_row)(bits.reshape(2, 2, *free.shape))
     for k in SEEDS:
-        alone = grown(bits[k], open)
+        alone = grown(bits[k], free)
         for a, b in zip(together, alone, strict=True):
-            np.testing.assert_array_equal(np.asarray(a).reshape(4, *open.shape)[k], b)
+            np.testing.assert_array_equal(np.asarray(a).reshape(4, *free.shape)[k], b)
 
 
 @pytest.mark.parametrize("steps", [7, 8, 254, 255, 256, 299, 400])
@@ -220,22 +222,24 @@ def test_a_front_may_take_hundreds_of_steps(steps):
 def test_a_cell_that_cannot_be_reached_stays_empty():
     bits = np.zeros((7, 7), np.uint8)
     bits[0, 0], bits[6, 6] = 1, 2
-    open = np.ones((7, 7), bool)
-    open[2:5, 2:5] = False
-    open[3, 3] = True  # walled in
-    diagram = grown(bits, open)
+    free = np.ones((7, 7), bool)
+    free[2:5, 2:5] = False
+    free[3, 3] = True  # walled in
+    diagram = grown(bits, free)
     assert diagram.labels[3, 3] == 0 and diagram.arrival[3, 3] == -1
-    np.testing.assert_array_equal(diagram.labels, reference.expand(bits, open, STEPS)[0])
+    np.testing.assert_array_equal(diagram.labels, reference.expand(bits, free, STEPS)[0])
 
 
-def test_a_derivative_passes_the_automaton_by():
-    bits, open = map(jnp.asarray, random_grid(0))
+def test_a_derivative_ignores_the_automaton():
+    bits, free = map(jnp.asarray, random_grid(0))
 
     def length(x):
         labels = jnp.where(x > 0.0, bits, jnp.zeros_like(bits))
-        return x**2 + jnp.sum(expand(labels, open, steps=STEPS).arrival).astype(x.dtype)
+        return x**2 + jnp.sum(expand(labels, free, steps=STEPS).arrival).astype(x.dtype)
 
-    looped = lambda x: jax.lax.scan(lambda s, _: (jax.checkpoint(length)(s), None), x, length=1)[0]
+    def looped(x):
+        return jax.lax.scan(lambda s, _: (jax.checkpoint(length)(s), None), x, length=1)[0]
+
     for function in (length, looped, jax.jit(looped)):
         assert jax.grad(function)(3.0) == 6.0
 
@@ -243,9 +247,9 @@ def test_a_derivative_passes_the_automaton_by():
 @pytest.mark.parametrize("steps", [1, 2, 9, STEPS])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_octagons_agree_with_a_slow_automaton(seed, steps):
-    bits, open = random_grid(seed, walls=0.35)
-    diagram = grown(bits, open, steps, octagon=True)
-    labels, arrival = reference.expand_octagons(bits, open, steps)
+    bits, free = random_grid(seed, walls=0.35)
+    diagram = grown(bits, free, steps, octagon=True)
+    labels, arrival = reference.expand_octagons(bits, free, steps)
     np.testing.assert_array_equal(diagram.labels, labels)
     np.testing.assert_array_equal(diagram.arrival, arrival)
 
@@ -254,10 +258,13 @@ def test_octagons_agree_with_a_slow_automaton(seed, steps):
 @pytest.mark.parametrize("mirror", [False, True])
 @pytest.mark.parametrize("quarters", range(4))
 def test_octagons_turn_and_mirror_with_the_grid(quarters, mirror, seed):
-    turn = lambda x: np.rot90(np.fliplr(x) if mirror else x, quarters)
-    bits, open = random_grid(seed)
-    before = grown(bits, open, octagon=True)
-    after = grown(turn(bits), turn(open), octagon=True)
+
+    def turn(x):
+        return np.rot90(np.fliplr(x) if mirror else x, quarters)
+
+    bits, free = random_grid(seed)
+    before = grown(bits, free, octagon=True)
+    after = grown(turn(bits), turn(free), octagon=True)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, turn(b)), after, before)
 
 
@@ -272,10 +279,10 @@ def test_one_source_grows_as_an_octagon(steps):
     np.testing.assert_array_equal(reached, inside)
 
 
-def numbered(bits, open):
-    """What fronts of numbers start from, cell by cell."""
-    start = np.full(bits.shape, SHUT, np.int8)
-    start[open & (bits == 0)] = EMPTY
+def encoded_sources(bits, free):
+    """The encoded sources, cell by cell."""
+    start = np.full(bits.shape, FROZEN, np.int8)
+    start[free & (bits == 0)] = EMPTY
     for cell in np.argwhere(bits):
         if reference.bits(int(bits[tuple(cell)])) == 1:
             start[tuple(cell)] = int(bits[tuple(cell)]).bit_length() - 1
@@ -283,38 +290,38 @@ def numbered(bits, open):
 
 
 @jax.jit
-def fronts_of(start, bits):
-    """Fronts of both kinds, and their sets."""
-    both = [expand_fronts(start, steps=9, octagon=octagon) for octagon in (False, True)]
-    return both, [diagram_of_fronts(bits, f, octagon=k == 1) for k, f in enumerate(both)]
+def expand_both(start, bits):
+    """Encoded diagrams of diamonds and octagons, and the diagrams."""
+    both = [expand_encoded(start, steps=9, octagon=octagon) for octagon in (False, True)]
+    return both, [decode(bits, x, octagon=k == 1) for k, x in enumerate(both)]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_numbers_grow_as_sets_do(seed):
-    bits, open = random_grid(seed, labels=32, dtype=np.uint32)
+def test_encoded_labels_expand_as_sets_do(seed):
+    bits, free = random_grid(seed, labels=32, dtype=np.uint32)
     bits[3, 4] = bits[15, 20] = 3 << seed  # sources of two labels
-    start = numbered(bits, open)
-    np.testing.assert_array_equal(initial_fronts(jnp.asarray(bits), jnp.asarray(open)), start)
-    slow = reference.expand(bits, open, 9), reference.expand_octagons(bits, open, 9)
-    for fronts, diagram, (labels, arrival) in zip(*fronts_of(start, bits), slow, strict=True):
+    start = encoded_sources(bits, free)
+    np.testing.assert_array_equal(encode_sources(jnp.asarray(bits), jnp.asarray(free)), start)
+    slow = reference.expand(bits, free, 9), reference.expand_octagons(bits, free, 9)
+    for encoded, diagram, (labels, arrival) in zip(*expand_both(start, bits), slow, strict=True):
         np.testing.assert_array_equal(diagram.labels, labels)
         np.testing.assert_array_equal(diagram.arrival, arrival)
         alone = np.vectorize(reference.bits)(labels) == 1
-        np.testing.assert_array_equal(np.asarray(fronts.cells) >= 0, alone)
-        np.testing.assert_array_equal(fronts.cells[alone], np.log2(labels[alone]))
+        np.testing.assert_array_equal(np.asarray(encoded.cells) >= 0, alone)
+        np.testing.assert_array_equal(encoded.cells[alone], np.log2(labels[alone]))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_cells_are_crowded_where_three_numbers_are_near(seed):
-    bits, open = random_grid(seed, labels=32, dtype=np.uint32)
+def test_encoded_junctions_are_where_three_labels_are_near(seed):
+    bits, free = random_grid(seed, labels=32, dtype=np.uint32)
     sources = bits != 0
-    fronts = fronts_of(numbered(bits, open), bits)[0][seed % 2]
-    cells, expected = np.asarray(fronts.cells), np.zeros(bits.shape, bool)
+    encoded = expand_both(encoded_sources(bits, free), bits)[0][seed % 2]
+    cells, expected = np.asarray(encoded.cells), np.zeros(bits.shape, bool)
     for cell in np.ndindex(*bits.shape):
         block = [near for near in reference.block(cell, bits.shape) if not sources[near]]
         held = {int(cells[near]) for near in block if cells[near] >= 0}
         expected[cell] = len(held) >= 3 and not sources[cell] and cells[cell] != EMPTY
-    np.testing.assert_array_equal(junction_cells_of_fronts(fronts, jnp.asarray(sources)), expected)
+    np.testing.assert_array_equal(encoded_junction_cells(encoded, jnp.asarray(sources)), expected)
     assert 5 < expected.sum() < expected.size / 2
 
 
@@ -324,24 +331,24 @@ GOOD = Diagram(labels=CELLS, arrival=jnp.zeros((4, 5), jnp.int32))
 
 
 @pytest.mark.parametrize(
-    "call, told",
+    "call, message",
     [
         (lambda: expand(CELLS.astype(int), MASK, steps=1), "labels is int64 (4, 5), not unsigned"),
         (
             lambda: expand(CELLS[0], MASK, steps=1),
             "labels is uint8 (5,), not unsignedinteger (H, W)",
         ),
-        (lambda: expand(CELLS, MASK[1:], steps=1), "open is bool (3, 5), not bool (4, 5)"),
-        (lambda: expand(CELLS, CELLS, steps=1), "open is uint8 (4, 5), not bool (4, 5)"),
+        (lambda: expand(CELLS, MASK[1:], steps=1), "free is bool (3, 5), not bool (4, 5)"),
+        (lambda: expand(CELLS, CELLS, steps=1), "free is uint8 (4, 5), not bool (4, 5)"),
         (lambda: expand(CELLS, MASK, steps=-1), "steps is -1, not 0 or more"),
-        (lambda: expand_fronts(MASK, steps=1), "start is bool (4, 5), not int8 (H, W)"),
-        (lambda: expand_fronts(BYTES[0], steps=1), "start is int8 (5,), not int8 (H, W)"),
-        (lambda: expand_fronts(BYTES, steps=-2), "steps is -2, not 0 or more"),
+        (lambda: expand_encoded(MASK, steps=1), "start is bool (4, 5), not int8 (H, W)"),
+        (lambda: expand_encoded(BYTES[0], steps=1), "start is int8 (5,), not int8 (H, W)"),
+        (lambda: expand_encoded(BYTES, steps=-2), "steps is -2, not 0 or more"),
         (lambda: branch_cells(GOOD, MASK[:, 1:]), "sources is bool (4, 4), not bool (4, 5)"),
         (lambda: junction_cells(GOOD, CELLS), "sources is uint8 (4, 5), not bool (4, 5)"),
         (lambda: junction_cells(Diagram(MASK, MASK), MASK), "diagram.labels is bool (4, 5), not"),
     ],
 )
-def test_wrong_shapes_and_types_are_told_while_tracing(call, told):
-    with pytest.raises(ValueError, match=re.escape(told)):
+def test_wrong_shapes_and_types_are_named_while_tracing(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         jax.eval_shape(call)

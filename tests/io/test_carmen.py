@@ -59,7 +59,7 @@ def test_reads_every_value(tmp_path):
     assert kinds == [np.float64, np.float64, np.float64, np.float32]
 
 
-def test_without_odom_lines_the_scans_are_the_wheel_stream(tmp_path):
+def test_without_odom_lines_the_scans_are_the_odometry_stream(tmp_path):
     log = carmen.read(save(tmp_path / "a.clf", [flaser(1), flaser(2), flaser(3)]))
     np.testing.assert_array_equal(log.odom_stream_times, log.times)
     np.testing.assert_array_equal(log.odom_stream_poses, log.odom_poses)
@@ -71,7 +71,7 @@ def test_file_order_is_kept_when_time_runs_backwards(tmp_path):
     np.testing.assert_allclose(log.odom_poses[:, 0], [0.5, 0.7, 0.6, 0.8])
 
 
-def test_readings_at_the_reach_or_not_positive_are_no_return(tmp_path):
+def test_readings_from_range_max_on_or_not_positive_are_no_return(tmp_path):
     readings = [0.0, -1.0, 7.9, 8.0, 81.91, "inf", "-inf", 7.999999999999, 1e300]
     path = save(tmp_path / "a.clf", [flaser(1, ranges=readings), flaser(2, ranges=readings)])
     log = carmen.read(path, range_max=8.0)
@@ -206,10 +206,10 @@ def test_files_that_are_no_log(tmp_path, monkeypatch):
     assert "cannot be read (Permission denied)" in complaint(locked)
 
 
-@pytest.mark.parametrize("reach", [0.0, -1.0, math.inf, math.nan])
-def test_impossible_reach(tmp_path, reach):
+@pytest.mark.parametrize("range_max", [0.0, -1.0, math.inf, math.nan, "far", None, True])
+def test_an_impossible_range_max_is_refused(tmp_path, range_max):
     with pytest.raises(InputError, match="range_max .* give a positive number"):
-        carmen.read(save(tmp_path / "a.clf", good()), range_max=reach)
+        carmen.read(save(tmp_path / "a.clf", good()), range_max=range_max)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_scans_that_are_there_twice_count_once(tmp_path):
     assert len(log.times) == 5 and log.num_skipped == 0 and log.lidar.angle_min == -np.pi / 2
 
 
-def test_broken_scans_of_the_newer_toolkit_are_told(tmp_path):
+def test_broken_scans_of_the_newer_toolkit_are_reported(tmp_path):
     good = [robotlaser(t, pose=(t, 0, 0)) for t in range(40)]
     lines = [*good, robotlaser(50, step=0.4)]
     assert carmen.read(save(tmp_path / "a.clf", lines)).num_skipped == 1
@@ -272,12 +272,12 @@ def test_broken_scans_of_the_newer_toolkit_are_told(tmp_path):
     assert "no odometry" in complaint(save(tmp_path / "c.clf", [robotlaser(t) for t in range(4)]))
 
 
-def way(t):
+def true_pose(t):
     """A drive of 1 m/s along an arc."""
     return np.array([10 * np.sin(0.1 * t), 10 - 10 * np.cos(0.1 * t), 0.1 * t])
 
 
-def told(t, pose):
+def odom_line(t, pose):
     """An ODOM line of a pose."""
     x, y, theta = pose
     return f"ODOM {x} {y} {theta} 1 0.1 0 {t} {TAIL}"
@@ -287,33 +287,42 @@ def drive(pose_of_scan, pose_of_wheels, count=60):
     """A log of a scan each second, between two readings of the wheels."""
     lines = []
     for t in range(count):
-        lines += [told(t, pose_of_wheels(t)), flaser(t + 0.25, pose=pose_of_scan(t + 0.25))]
-        lines.append(told(t + 0.5, pose_of_wheels(t + 0.5)))
+        lines += [odom_line(t, pose_of_wheels(t)), flaser(t + 0.25, pose=pose_of_scan(t + 0.25))]
+        lines.append(odom_line(t + 0.5, pose_of_wheels(t + 0.5)))
     return lines
 
 
-def test_poses_that_were_corrected_give_way_to_those_of_the_wheels(tmp_path):
-    drifting = lambda t: way(t) + np.array([0.05 * t, 0.0, 0.0])
-    log = carmen.read(save(tmp_path / "a.clf", drive(way, drifting)))
+def test_poses_that_were_corrected_are_replaced_by_odometry(tmp_path):
+
+    def drifting(t):
+        return true_pose(t) + np.array([0.05 * t, 0.0, 0.0])
+
+    log = carmen.read(save(tmp_path / "a.clf", drive(true_pose, drifting)))
     wanted = np.array([drifting(t) for t in log.times])
     np.testing.assert_allclose(log.odom_poses, wanted, atol=0.02)
     assert len(log.odometry_repairs) == 1 and "ODOM lines are used" in log.odometry_repairs[0]
 
 
-def test_poses_of_a_scanner_that_is_mounted_elsewhere_are_the_wheels_own(tmp_path):
-    mounted = lambda t: compose(way(t), np.array([0.3, -0.1, np.pi]))
-    log = carmen.read(save(tmp_path / "a.clf", drive(mounted, way)))
+def test_poses_of_a_scanner_off_the_centre_are_kept(tmp_path):
+
+    def mounted(t):
+        return compose(true_pose(t), np.array([0.3, -0.1, np.pi]))
+
+    log = carmen.read(save(tmp_path / "a.clf", drive(mounted, true_pose)))
     wanted = np.array([mounted(t) for t in log.times])
     np.testing.assert_allclose(log.odom_poses, wanted, atol=1e-9)
     assert log.odometry_repairs == ()
 
 
-def test_odometry_that_starts_anew_goes_on_where_it_was(tmp_path):
-    start = way(30.5)
-    anew = lambda t: way(t) if t < 31 else relative(start, way(t))
+def test_odometry_that_restarts_goes_on_where_it_was(tmp_path):
+    start = true_pose(30.5)
+
+    def anew(t):
+        return true_pose(t) if t < 31 else relative(start, true_pose(t))
+
     log = carmen.read(save(tmp_path / "a.clf", drive(anew, anew)))
     moved = relative(log.odom_poses[:-1], log.odom_poses[1:])
-    wanted = np.array([relative(way(t), way(t + 1)) for t in log.times[:-1]])
+    wanted = np.array([relative(true_pose(t), true_pose(t + 1)) for t in log.times[:-1]])
     assert np.abs(moved[32:] - wanted[32:]).max() < 0.01
     assert np.hypot(*moved[29:32, :2].T).max() < 1.1  # it stood still for half a second
     assert len(log.odometry_repairs) == 1 and "restarts (1 x)" in log.odometry_repairs[0]
@@ -326,11 +335,14 @@ def test_odometry_that_starts_anew_goes_on_where_it_was(tmp_path):
 
 
 def test_odometry_that_jumps_all_the_time_is_refused(tmp_path):
-    thrown = lambda t: np.array([100 * np.sin(t * t), 0.0, 0.0])
+
+    def thrown(t):
+        return np.array([100 * np.sin(t * t), 0.0, 0.0])
+
     text = complaint(save(tmp_path / "a.clf", drive(thrown, thrown)))
     assert "jumps" in text and "name a log with wheel odometry" in text
 
 
-def test_logs_of_real_robots_need_no_mending(shared_data):
+def test_logs_of_real_robots_need_no_odometry_repair(shared_data):
     for name in ("aces/aces", "freiburg-101/freiburg-101", "intel/intel"):
         assert carmen.read(shared_data / f"{name}.clf").odometry_repairs == ()

@@ -79,13 +79,17 @@ def test_a_state_comes_back_bit_for_bit(kept):
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_the_state_of_a_tuning_comes_back_with_its_optimiser(tmp_path, whole):
-    how = {"steps": 4, "optimiser": optimizers.default_optimizer(4, whole=whole)}
-    start = fitting.init(NoiseParams.for_laser_log(), frozen=["wall"], **how)
+    start = fitting.init(
+        NoiseParams.for_laser_log(),
+        frozen=["wall_angle_std"],
+        num_updates=4,
+        optimizer=optimizers.default_optimizer(4, whole=whole),
+    )
     moved = jax.tree.map(lambda x: np.asarray(x + np.ones((), np.asarray(x).dtype)), start)
     checkpoint.write(tmp_path / "a", moved, ABOUT)
     found = checkpoint.read(tmp_path / "a", start, ABOUT)
     check_equal(found, moved)
-    kept = found.optimiser if whole else found.optimiser[0]
+    kept = found.optimizer_state if whole else found.optimizer_state[0]
     assert isinstance(kept, BacktrackState if whole else optax.ScaleByAdamState)
     assert (kept.theta if whole else kept.mu).shape == (7,)
 
@@ -148,7 +152,7 @@ def test_it_goes_into_folders_that_exist_only(tmp_path):
         ({"another": 1}, "another"),
     ],
 )
-def test_what_belongs_to_another_run_is_told_by_the_field_that_differs(kept, change, field):
+def test_a_state_of_another_run_is_refused_by_the_field_that_differs(kept, change, field):
     assert complaint(kept, about=ABOUT | change) == f"{field}: belongs to another run"
     fewer = {name: value for name, value in ABOUT.items() if name != "rate"}
     assert complaint(kept, about=fewer) == "rate: belongs to another run"

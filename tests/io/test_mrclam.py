@@ -62,7 +62,7 @@ def slow_poses(odometry, times, *, hold=math.inf, part=0.01):
 
 
 def chained(motion):
-    """Poses (T, 3) that motions (T, 3) lead to, one composed with another."""
+    """Poses (T, 3) that motions (T, 3) lead to, by composition."""
     poses = [np.zeros(3)]
     for x, y, turn in motion[1:]:
         a, b, heading = poses[-1]
@@ -88,7 +88,8 @@ def test_reads_every_value(tmp_path):
     assert drive.truth_mask.all() and drive.num_skipped == 0
     np.testing.assert_array_equal(drive.landmark_names, [6, 9, 7])
     np.testing.assert_array_equal(drive.landmark_positions, [[1, 2], [-3, 4.5], [0.5, -1]])
-    kinds = "times motion truth places polar which names valid referenced".split()
+    names = "times odometry truth landmark_positions range_bearing landmark_index landmark_names"
+    kinds = (names + " valid truth_mask").split()
     types = [np.float64] * 4 + [np.float32] + [np.int32] * 2 + [np.bool_] * 2
     assert [getattr(drive, kind).dtype for kind in kinds] == types
 
@@ -115,11 +116,12 @@ def test_a_robot_can_be_read_without_reference(tmp_path):
     folder = save(tmp_path / "a", Robot1_Groundtruth=None)
     drive, other = mrclam.read(folder, 1), mrclam.read(save(tmp_path / "b"), 1)
     assert not drive.truth_mask.any() and not drive.truth.any()
-    for name in "times motion polar valid which places names".split():
+    names = "times odometry range_bearing valid landmark_index landmark_positions landmark_names"
+    for name in names.split():
         np.testing.assert_array_equal(getattr(drive, name), getattr(other, name))
 
 
-def test_sightings_at_the_first_and_the_last_line_of_odometry_count(tmp_path):
+def test_measurements_at_the_first_and_the_last_line_of_odometry_count(tmp_path):
     seen = [(t, 63, 1.0, 0.0) for t in (-0.001, 0, 5, 5.001)]
     drive = mrclam.read(save(tmp_path / "a", Robot1_Measurement=seen), 1, max_gap=math.inf)
     np.testing.assert_array_equal(drive.times, [START, START + 5])
@@ -199,7 +201,7 @@ def test_no_step_is_longer_than_asked_and_none_misses_motion_to_and_fro(tmp_path
         assert gaps.min() > 0.0 and gaps.max() <= longest + 1e-6
 
 
-def test_reference_is_interpolated_the_shorter_way_and_not_over_gaps(tmp_path):
+def test_reference_is_interpolated_by_the_shorter_turn_and_not_over_gaps(tmp_path):
     poses = [(1, 0, 0, 3.1), (1.2, 2, -4, -3.1), (1.5, 3, 3, 0), (1.6, 4, 5, 1)]
     when = (0.5, 0.9, 1.05, 1.15, 1.2, 1.35, 1.5, 1.575, 1.7)
     seen = [(t, 63, t, 0.0) for t in when]
@@ -232,13 +234,11 @@ def test_padding_is_invisible(tmp_path):
     assert few.valid.shape == (2, 2) and many.valid.shape == (3, 3)
     for drive in (few, many):
         assert (np.diff(drive.valid.astype(int), axis=1) <= 0).all()  # padding comes last
-        assert (drive.landmark_index[~drive.valid] == -1).all() and not drive.range_bearing[
-            ~drive.valid
-        ].any()
-        assert (drive.landmark_index[drive.valid] >= 0).all() and (
-            drive.range_bearing[drive.valid][:, 0] > 0
-        ).all()
-    for name in ("polar", "valid", "which"):
+        assert (drive.landmark_index[~drive.valid] == -1).all()
+        assert not drive.range_bearing[~drive.valid].any()
+        assert (drive.landmark_index[drive.valid] >= 0).all()
+        assert (drive.range_bearing[drive.valid][:, 0] > 0).all()
+    for name in ("range_bearing", "valid", "landmark_index"):
         np.testing.assert_array_equal(getattr(many, name)[:2, :2], getattr(few, name))
     assert not many.valid[:2, 2].any()
 
@@ -266,7 +266,7 @@ BAD = {
     "NaN": ("Robot1_Measurement", [*SEEN, (3, 63, 1, "nan")], ":6: bearing: nan is not finite"),
     "infinity": ("Robot1_Odometry", [(0, "inf", 0)], ":3: v: inf is not finite"),
     "time of odometry": ("Robot1_Odometry", [*ODOMETRY, (4.9, 0, 0)], ":7: t: runs backwards"),
-    "time of sightings": ("Robot1_Measurement", SEEN[::-1], ":5: t: runs backwards"),
+    "time of measurements": ("Robot1_Measurement", SEEN[::-1], ":5: t: runs backwards"),
     "time of poses": ("Robot1_Groundtruth", [*POSES, (1, 0, 0, 0)], ":63: t: runs backwards"),
     "negative range": ("Robot1_Measurement", [(1, 14, -2, 0)], ":3: range: is not positive"),
     "no range": ("Robot1_Measurement", [*SEEN, (2, 63, 0, 0)], ":6: range: is not positive"),
@@ -322,7 +322,7 @@ def test_impossible_step(tmp_path, longest):
 
 
 def plain(path):
-    """Numbers of a table, the simplest way."""
+    """Numbers of a table, as simply as possible."""
     lines = [line.split() for line in path.read_text().splitlines()]
     return [[float(field) for field in fields] for fields in lines if fields[0][0] != "#"]
 
@@ -354,17 +354,16 @@ def test_recorded_drives(shared_data, robot):
     pose, polar = drive.truth[step[known]], drive.range_bearing[step, slot][known]
     angle = pose[:, 2] + polar[:, 1]
     found = pose[:, :2] + polar[:, :1] * np.column_stack([np.cos(angle), np.sin(angle)])
-    error = np.hypot(*(found - drive.landmark_positions[drive.landmark_index[step, slot][known]]).T)
+    position = drive.landmark_positions[drive.landmark_index[step, slot][known]]
+    error = np.hypot(*(found - position).T)
     assert np.median(error) < 0.16 and np.percentile(error, 95) < 0.5
-    bearing = np.arctan2(
-        *(drive.landmark_positions[drive.landmark_index[step, slot][known]] - pose[:, :2]).T[::-1]
-    )
+    bearing = np.arctan2(*(position - pose[:, :2]).T[::-1])
     assert np.median(np.abs(wrapped(bearing - angle))) < 0.02
 
-    both = drive.truth_mask[1:] & drive.truth_mask[:-1]  # wheels and cameras tell the same
-    way = np.hypot(*np.diff(drive.truth[:, :2], axis=0).T)
+    both = drive.truth_mask[1:] & drive.truth_mask[:-1]  # odometry and cameras agree
+    distance = np.hypot(*np.diff(drive.truth[:, :2], axis=0).T)
     far, turn = np.hypot(*drive.odometry[1:, :2].T), np.diff(drive.truth[:, 2])
-    assert way[both].sum() == pytest.approx(far[both].sum(), rel=0.15)
+    assert distance[both].sum() == pytest.approx(far[both].sum(), rel=0.15)
     assert np.corrcoef(wrapped(turn)[both], drive.odometry[1:, 2][both])[0, 1] > 0.85
 
 

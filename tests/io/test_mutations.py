@@ -1,4 +1,4 @@
-"""Files of every kind, damaged in many ways: each is read, or refused in one clear line."""
+"""Files of every kind, damaged at random: each is read, or refused in one clear line."""
 
 import gzip
 import resource
@@ -7,12 +7,12 @@ import zipfile
 
 import numpy as np
 import pytest
-import test_bags
 import test_carmen
 import test_g2o
 import test_mrclam
 import test_npz
-import test_occupancy
+import test_ros_bags
+import test_ros_map
 from PIL import Image
 
 from jaxslam.filtering.noise import NoiseParams
@@ -27,7 +27,7 @@ HUGE = (b"1e999", b"-1e308", b"9" * 400, b"nan", b"-inf", b"1e-320", b"0", b"-1"
 def damaged(data, rng):
     """The bytes of a file with one to three things wrong."""
     for _ in range(rng.integers(1, 4)):
-        data = WAYS[rng.integers(len(WAYS))](data, rng)
+        data = DAMAGES[rng.integers(len(DAMAGES))](data, rng)
     return data
 
 
@@ -99,8 +99,8 @@ def write_otherwise(data, rng):
     return data.decode("latin-1").encode(other, errors="replace")
 
 
-WAYS = (flip, flip, cut, take_out, put_in, swap_lines, repeat_line, join_lines, change_field)
-WAYS += (change_field, drop_field, write_otherwise)
+DAMAGES = (flip, flip, cut, take_out, put_in, swap_lines, repeat_line, join_lines, change_field)
+DAMAGES += (change_field, drop_field, write_otherwise)
 
 
 def text(path, lines):
@@ -125,24 +125,24 @@ def lasers():
 
 
 def bag(path, ros):
-    test_bags.write(path, ros, scans=3)
+    test_ros_bags.write(path, ros, scans=3)
     return next(path.glob("*.db3")) if ros == 2 else path
 
 
 def metadata(path):
-    test_bags.write(path, 2, scans=3)
+    test_ros_bags.write(path, 2, scans=3)
     return path / "metadata.yaml"
 
 
 def arrays(path):
-    npz.write(path, test_npz.recording())
+    npz.write(path, test_npz.laser_log())
     return path
 
 
 def picture(path):
-    fields = "".join(f"{name}: {value}\n" for name, value in test_occupancy.FIELDS.items())
+    fields = "".join(f"{name}: {value}\n" for name, value in test_ros_map.FIELDS.items())
     path.write_text(fields)
-    Image.fromarray(np.tile(test_occupancy.SHADES, (4, 4))).save(path.with_suffix(".pgm"))
+    Image.fromarray(np.tile(test_ros_map.SHADES, (4, 4))).save(path.with_suffix(".pgm"))
     return path
 
 
@@ -156,10 +156,10 @@ def read_noise(path):
 
 
 def parent(path):
-    return readers.read(path.parent)
+    return readers.read_log(path.parent)
 
 
-def sightings(path):
+def read_robot(path):
     return mrclam.read(path.parent, 1)
 
 
@@ -169,23 +169,23 @@ def map_of(path):
 
 # How a good file is made, given the path of a new one, and how it is read, given that of the file.
 KINDS = {
-    "drive.clf": (lambda p: text(p, test_carmen.ok(12)), readers.read),
-    "drive.clf.gz": (lambda p: gzipped(p, test_carmen.ok(12)), readers.read),
-    "drive.log": (lambda p: text(p, lasers()), readers.read),
-    "graph.g2o": (lambda p: text(p, test_g2o.graph()), readers.read),
-    "graph.zip": (lambda p: zipped(p, test_g2o.graph()), readers.read),
-    "drive.npz": (arrays, readers.read),
-    "drive.bag": (lambda p: bag(p, 1), readers.read),
-    "drive": (lambda p: bag(p, 2), readers.read),
+    "drive.clf": (lambda p: text(p, test_carmen.good(12)), readers.read_log),
+    "drive.clf.gz": (lambda p: gzipped(p, test_carmen.good(12)), readers.read_log),
+    "drive.log": (lambda p: text(p, lasers()), readers.read_log),
+    "graph.g2o": (lambda p: text(p, test_g2o.graph()), readers.read_log),
+    "graph.zip": (lambda p: zipped(p, test_g2o.graph()), readers.read_log),
+    "drive.npz": (arrays, readers.read_log),
+    "drive.bag": (lambda p: bag(p, 1), readers.read_log),
+    "drive": (lambda p: bag(p, 2), readers.read_log),
     "described": (metadata, parent),
     "map.yaml": (picture, ros_map.read),
     "map.pgm": (lambda p: picture(p.with_suffix(".yaml")).with_suffix(".pgm"), map_of),
-    "way.tum": (lambda p: text(p, ["0.5 1 2 0 0 0 0.6 0.8"] * 5), tum.read),
+    "drive.tum": (lambda p: text(p, ["0.5 1 2 0 0 0 0.6 0.8"] * 5), tum.read),
     "all.relations": (lambda p: text(p, ["1 2 0.5 0.25 0 0 0 0.125"] * 5), relations.read),
     "noise.json": (noise, read_noise),
     "Robot1_Measurement.dat": (
         lambda p: test_mrclam.save(p.parent / "set") / p.name,
-        sightings,
+        read_robot,
     ),
 }
 

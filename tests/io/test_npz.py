@@ -1,3 +1,4 @@
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,7 +10,7 @@ from jaxslam.io.errors import InputError
 T, R = 7, 5
 
 
-def recording():
+def laser_log():
     rng = np.random.default_rng(0)
     ranges = rng.uniform(0.5, 9.0, (T, R)).astype(np.float32)
     ranges[1, 2] = np.inf
@@ -25,7 +26,7 @@ def recording():
 
 
 def arrays(**changes):
-    one = recording()
+    one = laser_log()
     whole = {"format": npz.FORMAT, "version": npz.VERSION}
     whole |= {"times": one.times, "odometry": one.odom_poses, "ranges": one.ranges}
     whole |= {"first": -1.0, "step": 0.5, "reach": 10.0} | changes
@@ -38,8 +39,8 @@ def file(tmp_path):
 
 
 def test_what_is_written_is_read(file):
-    npz.write(file, recording())
-    for a, b in zip(npz.read(file), recording(), strict=True):
+    npz.write(file, laser_log())
+    for a, b in zip(npz.read(file), laser_log(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert [one.name for one in file.parent.iterdir()] == [file.name]
 
@@ -80,14 +81,14 @@ def test_what_returned_nothing_is_infinite(file):
         ({"times": np.array([None] * T)}, "cannot|can be read|no NumPy file"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line(file, changes, message):
+def test_a_bad_array_is_reported_in_one_line(file, changes, message):
     np.savez(file, **arrays(**changes))
     with pytest.raises(InputError, match=message) as caught:
         npz.read(file)
     assert str(caught.value).startswith(f"{file}: ") and "\n" not in str(caught.value)
 
 
-def test_files_that_are_none_are_told(tmp_path, file):
+def test_files_of_another_kind_are_refused(tmp_path, file):
     for path, content in ((tmp_path / "a", b"x"), (tmp_path / "b", b"PK\3\4 and no more")):
         path.write_bytes(content)
         with pytest.raises(InputError, match="is no NumPy file that can be read"):
@@ -97,11 +98,11 @@ def test_files_that_are_none_are_told(tmp_path, file):
     with pytest.raises(InputError, match="is a folder"):
         npz.read(tmp_path)
     with pytest.raises(InputError, match="cannot be written"):
-        npz.write(tmp_path / "no" / "such.npz", recording())
+        npz.write(tmp_path / "no" / "such.npz", laser_log())
 
 
 def test_a_damaged_file_never_ends_in_a_traceback(file):
-    npz.write(file, recording())
+    npz.write(file, laser_log())
     whole = file.read_bytes()
     rng = np.random.default_rng(0)
     for _ in range(150):
@@ -113,3 +114,44 @@ def test_a_damaged_file_never_ends_in_a_traceback(file):
             assert np.isfinite(npz.read(file).odom_poses).all()
         except InputError as error:
             assert "\n" not in str(error)
+
+
+def test_lists_numpy_and_jax_arrays_are_written_alike(file):
+    log = laser_log()
+    npz.write(file, log)
+    expected = npz.read(file)
+    for convert in (np.ndarray.tolist, jnp.asarray):
+        npz.write(
+            file,
+            log._replace(
+                times=convert(log.times),
+                odom_poses=convert(log.odom_poses),
+                ranges=convert(log.ranges),
+                odom_stream_times=convert(log.odom_stream_times),
+                odom_stream_poses=convert(log.odom_stream_poses),
+            ),
+        )
+        for a, b in zip(npz.read(file), expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"times": np.zeros(3)}, r"odom_poses is float64 \(7, 3\), not \(3, 3\)"),
+        ({"odom_stream_poses": np.zeros((19, 3))}, r"odom_stream_poses is .*, not \(20, 3\)"),
+        ({"lidar": Lidar(R, range_std=0.0)}, "lidar.range_std is 0, not between 1e-06 and 1000"),
+        ({"lidar": Lidar(R, range_max=1e9)}, "lidar.range_max is 1e.09, not between"),
+    ],
+)
+def test_a_log_that_could_not_be_read_again_is_not_written(file, change, message):
+    with pytest.raises(ValueError, match=message):
+        npz.write(file, laser_log()._replace(**change))
+    assert not file.exists()
+
+
+@pytest.mark.parametrize("range_max", [0.0, -1.0, np.nan, "far"])
+def test_an_impossible_range_max_is_refused(file, range_max):
+    npz.write(file, laser_log())
+    with pytest.raises(InputError, match="range_max .* is not a length"):
+        npz.read(file, range_max=range_max)

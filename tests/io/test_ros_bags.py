@@ -21,8 +21,8 @@ def ranges():
     return np.random.default_rng(0).uniform(0.5, 9.0, (SCANS, BEAMS)).astype(np.float32)
 
 
-def way(t):
-    """Pose of the robot by its wheels at a time since the start; straight lines between halves."""
+def pose_at(t):
+    """Pose of the robot by odometry at a time since the start."""
     return np.interp(t, [0, 2, 9], [0, 1, 4]), 0.1 * t, 0.2 * t
 
 
@@ -89,9 +89,9 @@ def write(path, ros, *, poses="odometry", mount=True, roll=0.0, scans=SCANS, **h
                      make.transform(0.0, "mount", "laser", rest, roll)))  # fmt: skip
     for t in np.arange(0.0, scans + 1.0):
         if poses == "odometry":
-            said.append((t, "/odom", ros_bags.ODOMETRY, make.odometry(t, way(t))))
+            said.append((t, "/odom", ros_bags.ODOMETRY, make.odometry(t, pose_at(t))))
         if poses == "tf":
-            one = make.transform(t, "odom", "base_link", way(t))
+            one = make.transform(t, "odom", "base_link", pose_at(t))
             said.append((t, "/tf", TRANSFORMS, one))
     for i in range(scans):
         one = make.scan(i + 0.5, ranges()[i % SCANS], **how)
@@ -127,11 +127,13 @@ def test_scans_and_poses_of_the_scanner_are_read(tmp_path, ros, poses):
     np.testing.assert_array_equal(found.ranges, ranges())
     np.testing.assert_allclose(found.times - START, np.arange(SCANS) + 0.5, atol=1e-6)
     for i in range(SCANS):
-        before, after = (compose(jnp.array(way(float(t))), jnp.asarray(MOUNT)) for t in (i, i + 1))
+        before, after = (
+            compose(jnp.array(pose_at(float(t))), jnp.asarray(MOUNT)) for t in (i, i + 1)
+        )
         np.testing.assert_allclose(found.odom_poses[i], (before + after) / 2, atol=1e-9)
     np.testing.assert_allclose(found.lidar[:4], (BEAMS, FIRST, STEP, MOST), rtol=1e-6)
     assert found.num_skipped == 0 and len(found.odom_stream_times) == SCANS + 1
-    for a, b in zip(readers.read(path), found, strict=True):
+    for a, b in zip(readers.read_log(path), found, strict=True):
         np.testing.assert_array_equal(a, b)
     right = "/odom" if poses == "odometry" else "/tf"
     assert ros_bags.topics(path) == ("/scan", right)
@@ -145,7 +147,7 @@ def test_a_file_of_a_folder_stands_for_it(tmp_path):
 
 def test_without_transforms_the_scanner_is_the_robot(tmp_path, ros):
     found = ros_bags.read(write(place(tmp_path, ros), ros, mount=False))
-    np.testing.assert_allclose(found.odom_stream_poses[3], way(3.0), atol=1e-12)
+    np.testing.assert_allclose(found.odom_stream_poses[3], pose_at(3.0), atol=1e-12)
 
 
 @pytest.mark.parametrize("roll", [0.0, np.pi])
@@ -163,8 +165,11 @@ def test_beams_go_from_right_to_left_however_the_scanner_hangs(tmp_path, roll, s
     seen = lidar.angle_min + lidar.angle_increment * np.arange(BEAMS) + MOUNT[2]
     ours = MOUNT[:2] + found.ranges[0][:, None] * np.stack([np.cos(seen), np.sin(seen)], axis=1)
     assert lidar.angle_increment > 0
-    key = lambda points: points[np.lexsort(points.T.round(6))]
-    np.testing.assert_allclose(key(ours), key(right), atol=1e-5)
+
+    def in_order(points):
+        return points[np.lexsort(points.T.round(6))]
+
+    np.testing.assert_allclose(in_order(ours), in_order(right), atol=1e-5)
 
 
 def test_what_returned_nothing_is_infinite(tmp_path):
@@ -185,13 +190,13 @@ def test_scans_outside_the_time_of_the_odometry_are_left_out_and_counted(tmp_pat
             one = make.scan(float(i), ranges()[0])
             writer.write(scan, i + 1, make.store.serialize_cdr(one, ros_bags.SCAN))
             if i < scans - 1:
-                one = make.odometry(float(i), way(i))
+                one = make.odometry(float(i), pose_at(i))
                 writer.write(odom, i + 1, make.store.serialize_cdr(one, ros_bags.ODOMETRY))
     late = ros_bags.read(path)
     assert len(late.ranges) == scans - 1 and late.num_skipped == 1
 
 
-def test_topics_can_be_named_and_wrong_ones_are_told(tmp_path, ros):
+def test_topics_can_be_named_and_wrong_ones_are_refused(tmp_path, ros):
     path = write(place(tmp_path, ros), ros)
     named = ros_bags.read(path, scan_topic="/scan", odometry_topic="/odom")
     np.testing.assert_array_equal(named.ranges, ranges())
@@ -201,7 +206,7 @@ def test_topics_can_be_named_and_wrong_ones_are_told(tmp_path, ros):
         ros_bags.read(path, odometry_topic="/scan")
 
 
-def test_bags_that_lack_something_are_told(tmp_path, ros):
+def test_bags_without_scans_or_odometry_are_refused(tmp_path, ros):
     path = write(place(tmp_path, ros), ros, poses="none", mount=False)
     with pytest.raises(InputError, match="has no nav_msgs/msg/Odometry or tf2.*topics are: /scan"):
         ros_bags.read(path)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jaxslam.core.maps import OccupancyMap
 from jaxslam.io import ros_map
 from jaxslam.io.errors import InputError
 
@@ -40,17 +41,17 @@ def write(tmp_path):
     return make
 
 
-def assert_cells(map, occupied=OCCUPIED, free=FREE):
-    np.testing.assert_array_equal(map.occupied, turned(occupied))
-    np.testing.assert_array_equal(map.free, turned(free))
+def assert_cells(grid, occupied=OCCUPIED, free=FREE):
+    np.testing.assert_array_equal(grid.occupied, turned(occupied))
+    np.testing.assert_array_equal(grid.free, turned(free))
 
 
 @pytest.mark.parametrize("name", ["map.pgm", "map.png", "map.bmp"])
 def test_shades_become_cells_with_x_first(write, name):
-    map = ros_map.read(write(name=name))
-    assert_cells(map)
-    assert map.resolution == 0.05
-    np.testing.assert_array_equal(map.origin, [-1.5, 2.0, 0.25])
+    grid = ros_map.read(write(name=name))
+    assert_cells(grid)
+    assert grid.resolution == 0.05
+    np.testing.assert_array_equal(grid.origin, [-1.5, 2.0, 0.25])
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def test_a_missing_field_is_named(write, field):
         {"origin": "[0, 0, east]"},
         {"origin": "[0, 0, .nan]"},
         {"negate": 2},
-        {"negate": "no way"},
+        {"negate": "never"},
         {"occupied_thresh": 1.5},
         {"free_thresh": -0.1},
         {"free_thresh": 0.65},
@@ -218,3 +219,30 @@ def test_without_pyyaml_the_line_says_how_to_install_it(write, monkeypatch):
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(InputError, match=r"pip install 'jaxslam\[ros\]'"):
         ros_map.read(write())
+
+
+def test_a_map_comes_back_as_it_was_written(tmp_path):
+    grid = OccupancyMap(turned(OCCUPIED), turned(FREE), np.float32(0.5), [1, 2, 0.25])
+    ros_map.write(tmp_path / "a.yaml", grid)
+    found = ros_map.read(tmp_path / "a.yaml")
+    assert_cells(found)
+    assert found.resolution == 0.5 and found.origin.tolist() == [1, 2, 0.25]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"occupied": np.zeros(3, bool)}, r"occupied is bool \(3,\), not bool_? ?\(H, W\)"),
+        ({"occupied": np.zeros((3, 2))}, "occupied is float"),
+        ({"free": np.zeros((2, 3), bool)}, r"free is bool \(2, 3\), not bool_? ?\(3, 2\)"),
+        ({"resolution": 0.0}, "resolution is 0.0"),
+        ({"resolution": "fine"}, "resolution is <U4"),
+        ({"origin": [0.0, 0.0]}, r"origin is .* \(2,\), not \(3,\)"),
+        ({"origin": [0.0, np.nan, 0.0]}, "origin .*nan"),
+    ],
+)
+def test_what_is_no_map_is_not_written(tmp_path, change, message):
+    grid = OccupancyMap(turned(OCCUPIED), turned(FREE), 0.5, np.zeros(3))
+    with pytest.raises(ValueError, match=message):
+        ros_map.write(tmp_path / "a.yaml", grid._replace(**change))
+    assert not list(tmp_path.iterdir())

@@ -10,8 +10,8 @@ from jaxslam.simulation import robot
 from jaxslam.simulation.robot import Robot
 
 ROBOT = Robot()
-SENSE = wheel_coefficients(*ROBOT)
-RUNS = 20_000
+COEFFICIENTS = wheel_coefficients(*ROBOT)
+DRAWS = 20_000
 STANDARD_ERRORS = 5
 
 
@@ -25,14 +25,14 @@ def rolled(left, right):
 
 
 def sample(given):
-    """Motions (RUNS, 3) that are rolled when the encoders read `given`."""
-    draws = jax.random.normal(jax.random.key(0), (RUNS, 20, 2))
+    """Motions (DRAWS, 3) that are rolled when the encoders read `given`."""
+    draws = jax.random.normal(jax.random.key(0), (DRAWS, 20, 2))
     return np.asarray(batched_roll(draws, given))
 
 
 def spread(cov):
     """Standard error (3, 3) of each entry of a sample covariance."""
-    return np.sqrt((np.outer(np.diag(cov), np.diag(cov)) + cov**2) / RUNS)
+    return np.sqrt((np.outer(np.diag(cov), np.diag(cov)) + cov**2) / DRAWS)
 
 
 @pytest.mark.parametrize("wheels", [(0.3, 0.3), (0.1, 0.4), (-0.2, 0.3), (-0.3, 0.3), (0.0, 0.0)])
@@ -63,7 +63,7 @@ def test_an_undisturbed_roll_is_what_odometry_reads():
 def test_noise_straight_and_on_the_spot_is_that_of_the_wheels(wheels):
     given = rolled(*wheels)
     cov = np.cov(sample(given).T)
-    model = np.asarray(motion_model.odometry_cov(SENSE, given))
+    model = np.asarray(motion_model.odometry_cov(COEFFICIENTS, given))
     bend = given[2] ** 2 / 12 * model[0, 0]  # the bend of the arc, which the model leaves out
     assert np.all(np.abs(cov - model) < STANDARD_ERRORS * spread(cov) + bend)
 
@@ -72,9 +72,9 @@ def test_noise_straight_and_on_the_spot_is_that_of_the_wheels(wheels):
 def test_noise_on_an_arc_is_a_near_upper_bound(wheels):
     given = rolled(*wheels)
     cov = np.cov(sample(given).T)
-    model = np.asarray(motion_model.odometry_cov(SENSE, given))
+    model = np.asarray(motion_model.odometry_cov(COEFFICIENTS, given))
     slack = 1 + ROBOT.wheel_base * abs(given[2]) / sum(wheels)  # (2 d + base t) / (|l| + |r|)
-    low, high = 1 - STANDARD_ERRORS * np.sqrt(2 / RUNS), 1 + STANDARD_ERRORS * np.sqrt(2 / RUNS)
+    low, high = 1 - STANDARD_ERRORS * np.sqrt(2 / DRAWS), 1 + STANDARD_ERRORS * np.sqrt(2 / DRAWS)
     turned = np.diag(model)[2] / np.diag(cov)[2]
     assert low * slack < turned < high * slack
     assert np.all(np.diag(model) > low * np.diag(cov))
@@ -84,7 +84,7 @@ def test_noise_on_an_arc_is_a_near_upper_bound(wheels):
 def test_the_robot_that_rolls_straight_is_not_biased():
     error = sample(rolled(0.3, 0.3)) - np.asarray(rolled(0.3, 0.3))
     bend = np.array([0.3 * 0.02**2 / 6, 0, 0])  # E[chord] < arc, to the order of var_t
-    assert np.all(np.abs(error.mean(0)) < STANDARD_ERRORS * error.std(0) / np.sqrt(RUNS) + bend)
+    assert np.all(np.abs(error.mean(0)) < STANDARD_ERRORS * error.std(0) / np.sqrt(DRAWS) + bend)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -99,8 +99,9 @@ def test_noise_of_many_small_motions_is_that_of_one():
     steps, part = 50, jnp.array([0.3 / 50, 0.0, 0.0])
     cov, ahead = jnp.zeros((3, 3)), jnp.eye(3).at[1, 2].set(part[0])
     for _ in range(steps):
-        cov = ahead @ cov @ ahead.T + motion_model.odometry_cov(SENSE, part)
-    np.testing.assert_allclose(cov, motion_model.odometry_cov(SENSE, steps * part), atol=1e-12)
+        cov = ahead @ cov @ ahead.T + motion_model.odometry_cov(COEFFICIENTS, part)
+    whole = motion_model.odometry_cov(COEFFICIENTS, steps * part)
+    np.testing.assert_allclose(cov, whole, atol=1e-12)
 
 
 def test_gradients_are_finite_at_rest():
@@ -108,8 +109,9 @@ def test_gradients_are_finite_at_rest():
     noise = jax.jacrev(motion_model.odometry_cov, argnums=(0, 1))
     true = jax.jacrev(lambda given: robot.true_increment(ROBOT, jnp.ones((4, 2)), given))
     turned = jax.jacrev(lambda both: robot.wheel_increment(both[0], both[1], ROBOT.wheel_base))
-    sense = jax.jacrev(lambda k: motion_model.wheel_coefficients(ROBOT._replace(encoder_noise=k)))
-    for derivative, *given in (noise, SENSE, rest), (true, rest), (turned, rest), (sense, 0.0):
+    coefficients = jax.jacrev(lambda k: wheel_coefficients(ROBOT.wheel_base, k))
+    pairs = (noise, COEFFICIENTS, rest), (true, rest), (turned, rest), (coefficients, 0.0)
+    for derivative, *given in pairs:
         for leaf in jax.tree.leaves(jax.jit(derivative)(*given)):
             assert np.isfinite(leaf).all()
-    np.testing.assert_array_equal(motion_model.odometry_cov(SENSE, rest), jnp.zeros((3, 3)))
+    np.testing.assert_array_equal(motion_model.odometry_cov(COEFFICIENTS, rest), jnp.zeros((3, 3)))

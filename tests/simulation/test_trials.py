@@ -38,51 +38,49 @@ PATH = path_following.densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6
 SETTING = (
     CONFIG,
     NoiseParams.for_simulated_robot(*ROBOT),
-    World(jnp.asarray(worlds.named("fig07").walls)),
     ROBOT,
+    World(jnp.asarray(worlds.named("fig07").walls)),
     jnp.asarray(PATH),
 )
 
 
-def experiment(runs, devices, key=KEY, first=0):
-    own = jax.devices()[:devices]
-    return list(
-        trials.run_trials(key, *SETTING, num_trials=runs, num_scans=STEPS, first=first, devices=own)
-    )
+def experiment(num_trials, num_devices, key=KEY, first=0):
+    sizes = {"num_trials": num_trials, "num_scans": STEPS, "first": first}
+    return list(trials.run_trials(key, *SETTING, **sizes, devices=jax.devices()[:num_devices]))
 
 
 @pytest.fixture(scope="module")
 def nine():
-    return experiment(9, devices=2)
+    return experiment(9, num_devices=2)
 
 
 def assert_same(one, two):
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
-def test_runs_depend_neither_on_their_number_nor_on_the_devices(nine):
+def test_trials_depend_neither_on_their_number_nor_on_the_devices(nine):
     many, few = (
         episodes.concatenate_results(nine),
-        episodes.concatenate_results(experiment(6, devices=1)),
+        episodes.concatenate_results(experiment(6, num_devices=1)),
     )
     assert_same(jax.tree.map(lambda x: x[:6], many), few)
     assert len(np.unique(many.truth[:, -1, 0])) == 9
     assert all(isinstance(x, np.ndarray) for x in many)
 
 
-@pytest.mark.parametrize("first, runs, sizes", [(0, 9, [4, 4, 1]), (3, 6, [1, 2]), (6, 7, [1])])
-def test_an_experiment_goes_on_where_another_ended(nine, first, runs, sizes):
-    rest = experiment(runs, devices=1, first=first)
+@pytest.mark.parametrize("first, total, sizes", [(0, 9, [4, 4, 1]), (3, 6, [1, 2]), (6, 7, [1])])
+def test_an_experiment_resumes_where_another_ended(nine, first, total, sizes):
+    rest = experiment(total, num_devices=1, first=first)
     assert [len(part.truth) for part in rest] == sizes
-    whole = jax.tree.map(lambda x: x[first:runs], episodes.concatenate_results(nine))
+    whole = jax.tree.map(lambda x: x[first:total], episodes.concatenate_results(nine))
     assert_same(episodes.concatenate_results(rest), whole)
 
 
-def test_there_is_nothing_after_the_last_run():
-    assert experiment(8, devices=2, first=8) == []
+def test_there_is_nothing_after_the_last_trial():
+    assert experiment(8, num_devices=2, first=8) == []
 
 
-def test_experiment_yields_the_runs_in_order(nine):
+def test_experiment_yields_the_trials_in_order(nine):
     assert [len(part.truth) for part in nine] == [8, 1]
     keys = jax.vmap(lambda k: jax.random.split(k)[0])(
         jnp.stack([jax.random.fold_in(KEY, i) for i in range(9)])
@@ -122,26 +120,30 @@ def test_drives_stay_near_the_path_and_reach_its_end(drives):
     assert np.linalg.norm(truth[:, -1, :2] - PATH[-1], axis=-1).max() < 0.35  # one stride
 
 
-def test_drive_steps_is_the_noise_free_length(steps):
+def test_number_of_scans_is_that_of_the_noise_free_drive(steps):
     still = ROBOT._replace(encoder_noise=0.0)
-    truth, told = jax.jit(lambda key: drive(key, still, jnp.asarray(PATH), num_scans=steps + 2))(
-        KEY
-    )
-    np.testing.assert_array_equal(np.any(told != 0, axis=1)[1:], np.arange(steps + 1) < steps - 1)
-    np.testing.assert_allclose(se2.dead_reckoning(truth[0], told), truth, atol=1e-12)
+
+    @jax.jit
+    def longer(key):
+        return drive(key, still, jnp.asarray(PATH), num_scans=steps + 2)
+
+    truth, odometry = longer(KEY)
+    moves = np.any(odometry != 0, axis=1)[1:]
+    np.testing.assert_array_equal(moves, np.arange(steps + 1) < steps - 1)
+    np.testing.assert_allclose(se2.dead_reckoning(truth[0], odometry), truth, atol=1e-12)
 
 
 def test_encoders_have_the_noise_they_promise(drives):
     """A wheel that rolls w errs by k sqrt(|w|), independent of the other; 5 standard errors."""
-    truth, told = drives
+    truth, odometry = drives
     moves = jax.vmap(relative)(truth[:, :-1].reshape(-1, 3), truth[:, 1:].reshape(-1, 3))
-    told = told[:, 1:].reshape(-1, 3)
-    said = np.stack(jax.vmap(robot.wheel_distances, (0, None))(jnp.asarray(told), ROBOT.wheel_base))
-    rolls = np.all(np.abs(said) > 0, axis=0)
-    variance = ROBOT.encoder_noise**2 * np.abs(said).sum(axis=0)[rolls]
-    turn = np.asarray(wrap_angle(moves[:, 2] - told[:, 2]))[rolls]
-    rolled = np.stack(jax.vmap(robot.wheel_distances, (0, None))(moves, ROBOT.wheel_base))
-    forward = np.mean(rolled - said, axis=0)[rolls]
+    odometry = odometry[:, 1:].reshape(-1, 3)
+    distances = jax.vmap(lambda motion: robot.wheel_distances(motion, ROBOT.wheel_base))
+    encoders = np.stack(distances(jnp.asarray(odometry)))
+    rolls = np.all(np.abs(encoders) > 0, axis=0)
+    variance = ROBOT.encoder_noise**2 * np.abs(encoders).sum(axis=0)[rolls]
+    turn = np.asarray(wrap_angle(moves[:, 2] - odometry[:, 2]))[rolls]
+    forward = np.mean(np.stack(distances(moves)) - encoders, axis=0)[rolls]
     count = rolls.sum()
     assert count > 5000
     for error, spread in [(turn, variance / ROBOT.wheel_base**2), (forward, variance / 4)]:
@@ -150,8 +152,8 @@ def test_encoders_have_the_noise_they_promise(drives):
         assert abs(np.mean(z**2) - 1) < 5 * np.sqrt(2 / count)
 
 
-def track(final, *, finite=True, nan=False):
-    """A run of two scans whose last estimate is `final` [m] off, dead reckoning twice that."""
+def result_of(final, *, finite=True, nan=False):
+    """A trial of two scans whose last estimate is `final` [m] off, dead reckoning twice that."""
     estimate = np.zeros((2, 3))
     estimate[1, 0] = np.nan if nan else final
     odometry = np.zeros((2, 3))
@@ -169,9 +171,13 @@ def track(final, *, finite=True, nan=False):
     )
 
 
-def test_evaluate_counts_diverged_and_nonfinite_runs_and_masks_the_latter():
-    runs = [track(0.2), track(1.5), track(0.0, nan=True), track(0.0, finite=False), track(-0.4)]
-    summary = evaluate(jax.tree.map(lambda *x: np.stack(x), *runs))
+def summary_of(*results):
+    return evaluate(jax.tree.map(lambda *x: np.stack(x), *results))
+
+
+def test_evaluate_counts_diverged_and_nonfinite_trials_and_masks_the_latter():
+    nonfinite = result_of(0.0, nan=True), result_of(0.0, finite=False)
+    summary = summary_of(result_of(0.2), result_of(1.5), *nonfinite, result_of(-0.4))
     good = np.array([0.2, 1.5, -0.4])
     assert summary["runs"] == 5 and summary["diverged_runs"] == [1, 2, 3]
     assert summary["nonfinite_runs"] == [2, 3] and summary["nonfinite"] == 2
@@ -186,22 +192,139 @@ def test_evaluate_counts_diverged_and_nonfinite_runs_and_masks_the_latter():
     )
 
 
-def test_steps_that_never_were_and_runs_without_truth_count_nowhere():
-    """A drive of two scans beside one of five, as `episodes.stack_episodes` pads it, and one without truth."""
-    fill = lambda x: np.pad(x, [(0, 3 if x.ndim and len(x) == 2 else 0)] + [(0, 0)] * (x.ndim - 1))
-    short = track(0.2)
-    padded = jax.tree.map(lambda x: fill(np.asarray(x)) if np.ndim(x) else x, short)
+def test_padding_and_trials_without_truth_do_not_count():
+    """Drives of two and of five scans, as `stack_episodes` pads them, and one without truth."""
+
+    def fill(x):
+        x = np.asarray(x)
+        ends = [(0, 3 if x.ndim and len(x) == 2 else 0)] + [(0, 0)] * (x.ndim - 1)
+        return np.pad(x, ends) if x.ndim else x
+
+    short = result_of(0.2)
+    padded = jax.tree.map(fill, short)
     padded.estimate[2:] = padded.estimate[1]
     long = padded._replace(
         truth_mask=np.ones(5, bool), num_steps=np.int32(5), estimate=np.zeros((5, 3))
     )
     blind = padded._replace(truth_mask=np.zeros(5, bool), estimate=np.full((5, 3), 7.0))
-    stack = lambda *runs: evaluate(jax.tree.map(lambda *x: np.stack(x), *runs))
-    alone, both = stack(short), stack(padded, blind)
+    alone, both = summary_of(short), summary_of(padded, blind)
     for key in ("position_rmse_m", "heading_rmse_deg", "nees", "diverged", "matches"):
         assert both[key] == alone[key], key
     assert both["scans"] == 4 and both["dead_reckoning"] == alone["dead_reckoning"]
-    assert stack(padded, long)["scans"] == 7 and stack(padded, long)["matches"] == 6 / 7
-    nothing = stack(blind)
+    assert summary_of(padded, long)["scans"] == 7 and summary_of(padded, long)["matches"] == 6 / 7
+    nothing = summary_of(blind)
     assert nothing["position_rmse_m"] is None and nothing["nees"] is None
     assert nothing["diverged"] == 0
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """Calls of the simulation, which is left out."""
+    calls = []
+
+    def simulate(keys, config, robot, world, path, *, num_scans):
+        calls.append((keys.shape, robot, world.walls, path, num_scans))
+
+    monkeypatch.setattr(trials, "simulate_keys", simulate)
+    monkeypatch.setattr(trials, "_SPREAD_GROUPS", None)
+    return calls
+
+
+def test_the_drive_is_by_default_that_of_the_office(simulated, monkeypatch):
+    monkeypatch.setattr(trials, "num_scans_of_drive", lambda robot, path: len(path))
+    trials.simulate_episodes(KEY, CONFIG, num_trials=3)
+    trials.simulate_episodes(KEY, CONFIG, ROBOT, worlds.named("office"), OFFICE, num_trials=3)
+    (shape, robot_, walls, path, num_scans), explicit = simulated
+    assert shape == (3,) and robot_ == Robot() and num_scans == len(path) == len(OFFICE)
+    np.testing.assert_array_equal(walls, worlds.named("office").walls)
+    np.testing.assert_array_equal(path, OFFICE)
+    assert explicit[4] == num_scans and walls.dtype == path.dtype == jnp.float64
+
+
+OFFICE = path_following.densify(worlds.waypoints("office"))
+
+
+@pytest.mark.parametrize("convert", [np.asarray, np.float32, jnp.asarray, np.ndarray.tolist])
+def test_walls_and_paths_are_lists_or_arrays_of_either_precision(simulated, convert):
+    walls, path = (np.float32(x).astype(float) for x in (worlds.named("fig07").walls, PATH))
+    given = CONFIG, Robot(np.float32(0.5), 0), World(convert(walls)), convert(path)
+    trials.simulate_episodes(KEY, *given, num_trials=np.int32(2), num_scans=np.int64(4))
+    ((shape, robot_, own_walls, own_path, num_scans),) = simulated
+    assert (shape, robot_, num_scans) == ((2,), Robot(0.5, 0.0), 4)
+    np.testing.assert_array_equal(own_walls, walls)
+    np.testing.assert_array_equal(own_path, path)
+
+
+WIDE = CONFIG._replace(filter=FilterConfig(field_of_view=(-3.0, 3.0)))
+DRIVE = {"robot": ROBOT, "world": "fig07", "path": PATH, "num_scans": 4, "num_trials": 2}
+
+
+@pytest.mark.parametrize(
+    "changes, line",
+    [
+        ({"key": 0}, r"key is 0, not one key as jax.random.key\(seed\) makes it"),
+        ({"key": jax.random.PRNGKey(0)}, r"key is uint32 \(2,\), not one key"),
+        ({"key": jax.random.split(KEY)}, r"key is .* \(2,\), not one key"),
+        ({"config": CONFIG.filter}, "config is FilterConfig, not Config"),
+        ({"config": WIDE}, "make the configuration with Config.for_lidar"),
+        ({"robot": 0.4}, "robot is float, not Robot"),
+        ({"robot": Robot(0.0)}, "robot.wheel_base is 0.0, not above 0"),
+        ({"robot": Robot(0.4, -1.0)}, "robot.encoder_noise is -1.0, not 0 or more"),
+        ({"world": "moon"}, "no world named 'moon'; there are: fig04, .*, office"),
+        ({"world": np.zeros((4, 4))}, "world is ndarray, not World or one of the names fig04, "),
+        ({"world": World(np.zeros((4, 2)))}, r"world.walls is float64 \(4, 2\), not .*\(S, 4\)"),
+        (
+            {"world": World(np.full((4, 4), np.nan))},
+            "world.walls holds .* not finite",
+        ),
+        ({"path": None}, "no drive named 'fig07'; there are: office"),
+        ({"path": None, "world": worlds.named("fig07")}, "path is None; a world without a name"),
+        ({"path": PATH[:5]}, r"path is \(5, 2\), not \(N >= 6, 2\)"),
+        ({"path": PATH[:, :1]}, r"path is float64 \(\d+, 1\), not floating \(N, 2\)"),
+        ({"path": np.full((6, 2), np.inf)}, "path holds numbers that are not finite"),
+        ({"path": 2.0 * np.arange(14.0).reshape(7, 2)}, "path has points 5.66 m apart; .*densify"),
+        ({"path": np.linspace(PATH[0], PATH[-1], 999)}, "40 of them must span 0.5 m: .*densify"),
+        ({"num_scans": 0}, "num_scans is 0; it must be 1 or more"),
+        ({"num_scans": 2.5}, "num_scans is 2.5, not a whole number"),
+        ({"num_trials": 0}, "num_trials is 0; it must be 1 or more"),
+    ],
+)
+def test_a_simulation_that_is_not_possible_is_refused(simulated, changes, line):
+    given = {"key": KEY, "config": CONFIG} | DRIVE | changes
+    with pytest.raises(ValueError, match=line):
+        trials.simulate_episodes(**given)
+    with pytest.raises(ValueError, match=line):  # at the call, not at the first result
+        trials.run_trials(params=SETTING[1], **given)
+    one = {name: x for name, x in given.items() if name != "num_trials"}
+    if "num_trials" not in changes:
+        with pytest.raises(ValueError, match=line):
+            trials.replay_trial(params=SETTING[1], **one, trial=0)
+    assert not simulated
+
+
+@pytest.mark.parametrize(
+    "changes, line",
+    [
+        ({"first": -1}, "first is -1; it must be 0 or more"),
+        ({"devices": []}, "devices is empty"),
+        ({"params": None}, "params is NoneType, not NoiseParams"),
+        ({"params": SETTING[1]._replace(range_std=0.0)}, "params.range_std is 0.0"),
+    ],
+)
+def test_trials_that_are_not_possible_are_refused(simulated, changes, line):
+    with pytest.raises(ValueError, match=line):
+        trials.run_trials(**{"key": KEY, "config": CONFIG, "params": SETTING[1]} | DRIVE | changes)
+
+
+def test_a_path_that_is_too_short_is_refused_by_all_that_drive_along_it():
+    with pytest.raises(ValueError, match=r"path is \(5, 2\), not \(N >= 6, 2\)"):
+        num_scans_of_drive(ROBOT, PATH[:5])
+    with pytest.raises(ValueError, match=r"path is \(5, 2\), not \(N >= 6, 2\)"):
+        drive(KEY, ROBOT, jnp.asarray(PATH[:5]), num_scans=3)
+
+
+def test_a_trial_is_replayed_with_its_own_noise(nine):
+    truth, result = trials.replay_trial(KEY, *SETTING, trial=5, num_scans=STEPS)
+    whole = episodes.concatenate_results(nine)
+    np.testing.assert_allclose(truth, whole.truth[5], atol=1e-12)
+    np.testing.assert_allclose(result.poses, whole.estimate[5], atol=1e-9)

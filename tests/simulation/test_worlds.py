@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import truth
+from experiments import ground_truth
 from jaxslam.simulation import floor_plans, worlds
 from jaxslam.simulation.path_following import densify
 
@@ -37,7 +37,7 @@ def test_axis_aligned_walls_are_closed(name):
 @pytest.mark.parametrize("name", worlds.NAMES)
 def test_walls_have_a_length(name):
     walls = worlds.named(name).walls
-    assert walls.ndim == 2 and walls.descriptor[1] == 4 and np.isfinite(walls).all()
+    assert walls.ndim == 2 and walls.shape[1] == 4 and np.isfinite(walls).all()
     assert np.all(np.hypot(*(walls[:, 2:] - walls[:, :2]).T) > 0.001)
 
 
@@ -58,11 +58,11 @@ def test_unknown_names_are_answered_with_the_known_ones():
             ask("nowhere")
 
 
-def test_places_are_inside_and_near_each_other():
-    places = worlds.scan_poses("fig07")
-    assert places.shape == (10, 3)
-    assert clearance(places[:, :2], worlds.named("fig07").walls).min() >= 0.4
-    assert np.hypot(*np.diff(places[:, :2], axis=0).T).max() <= 1.5
+def test_scan_poses_are_inside_and_near_each_other():
+    poses = worlds.scan_poses("fig07")
+    assert poses.shape == (10, 3)
+    assert clearance(poses[:, :2], worlds.named("fig07").walls).min() >= 0.4
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() <= 1.5
 
 
 def test_office_is_large_and_light():
@@ -73,7 +73,7 @@ def test_office_is_large_and_light():
     assert np.any(np.all(np.abs(along) > 0.3, axis=1)), "no oblique wall"
 
 
-def test_office_drive_is_long_clear_and_passes_places_twice():
+def test_office_drive_is_long_clear_and_visits_positions_twice():
     path = densify(worlds.waypoints("office"))
     assert 65 <= length(path) <= 85
     assert clearance(path, worlds.named("office").walls).min() >= 0.4
@@ -91,22 +91,22 @@ def test_a_floor_plan_is_its_keys_alone_and_its_padding_has_no_length(seed):
     walls = plan(seed)
     np.testing.assert_array_equal(walls, plan(seed))
     assert not np.array_equal(walls, plan(seed + 100))
-    assert walls.descriptor == (floor_plans.PLAN_WALLS, 4) and np.isfinite(walls).all()
+    assert walls.shape == (floor_plans.PLAN_WALLS, 4) and np.isfinite(walls).all()
     sizes = np.hypot(*(walls[:, 2:] - walls[:, :2]).T)
-    count = len(truth.solid(walls))
+    count = len(ground_truth.without_padding(walls))
     assert 8 < count < floor_plans.PLAN_WALLS
     assert np.all(sizes[:count] > 1e-3) and not walls[count:].any()
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_beam_escapes_a_floor_plan(seed):
-    walls = truth.solid(plan(seed))
+    walls = ground_truth.without_padding(plan(seed))
     low, high = walls.reshape(-1, 2).min(axis=0), walls.reshape(-1, 2).max(axis=0)
-    places = np.random.default_rng(seed).uniform(low, high, (400, 2))
-    inside = truth.Free(walls).holds(places) & (clearance(places, walls) > 0.1)
+    positions = np.random.default_rng(seed).uniform(low, high, (400, 2))
+    inside = ground_truth.FreeSpace(walls).contains(positions) & (clearance(positions, walls) > 0.1)
     assert inside.sum() > 50
-    for place in places[inside]:
-        end = truth.hits(place, np.linspace(-np.pi, np.pi, 91), walls)
+    for position in positions[inside]:
+        end = ground_truth.hits(position, np.linspace(-np.pi, np.pi, 91), walls)
         assert np.isfinite(end).all()
 
 

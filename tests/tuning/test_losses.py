@@ -12,8 +12,8 @@ T = 30
 
 
 @pytest.fixture(scope="module")
-def run():
-    """Info and log of a run: T poses, their covariances, innovations; some truth is unknown."""
+def filtered():
+    """Step infos of T steps and their episode, whose truth is partly unknown; and pose errors."""
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(T, 3)) * [3.0, 3.0, 2.0]
     root = rng.normal(size=(T, 3, 3)) * 0.1
@@ -26,57 +26,75 @@ def run():
     rest |= {"pose": jnp.array(pose), "pose_cov": jnp.array(cov)}
     rest |= {"log_likelihood": jnp.array(rng.normal(size=T)), "nis": jnp.ones(T)}
     rest |= {"dof": jnp.array(rng.integers(0, 9, T), jnp.int32)}
-    judged = rng.random(T) < 0.7
-    judged[0] = True
-    blind = np.where(judged[:, None], truth, 99.0)
-    return StepInfo(**rest), Episode(jnp.array(blind), None, None, None, jnp.array(judged)), error
+    truth_mask = rng.random(T) < 0.7
+    truth_mask[0] = True
+    blind = np.where(truth_mask[:, None], truth, 99.0)
+    return (
+        StepInfo(**rest),
+        Episode(jnp.array(blind), None, None, None, jnp.array(truth_mask)),
+        error,
+    )
 
 
-def test_localisation_is_the_mean_square_where_the_truth_is_known(run):
-    info, log, error = run
-    square = error[np.asarray(log.truth_mask)] ** 2
+def test_pose_mse_is_the_mean_square_error_where_the_truth_is_known(filtered):
+    info, episode, error = filtered
+    square = error[np.asarray(episode.truth_mask)] ** 2
     right = np.mean(square[:, 0] + square[:, 1] + losses.HEADING_WEIGHT * square[:, 2])
-    np.testing.assert_allclose(losses.pose_mse(info, log), right)
+    np.testing.assert_allclose(losses.pose_mse(info, episode), right)
 
 
-def density(info, log, error):
+def density(info, episode, error):
     """Mean negative log-density, by SciPy, without its constant and the certain first pose."""
-    use = np.flatnonzero(np.asarray(log.truth_mask))[1:]
+    use = np.flatnonzero(np.asarray(episode.truth_mask))[1:]
     each = [multivariate_normal.logpdf(error[t], cov=np.asarray(info.pose_cov[t])) for t in use]
     return -np.mean(each) - 1.5 * np.log(2 * np.pi)
 
 
-def test_calibrated_is_the_density_of_the_truth(run):
-    np.testing.assert_allclose(losses.pose_nll(*run[:2]), density(*run), rtol=1e-8)
+def test_pose_nll_is_the_negative_log_density_of_the_truth(filtered):
+    np.testing.assert_allclose(losses.pose_nll(*filtered[:2]), density(*filtered), rtol=1e-8)
 
 
-def test_of_all_sizes_calibrated_takes_that_with_the_expected_nees(run):
-    info, log, error = run
-    use = np.flatnonzero(np.asarray(log.truth_mask))[1:]
+def test_pose_nll_is_least_for_the_covariance_scale_with_the_expected_nees(filtered):
+    info, episode, error = filtered
+    use = np.flatnonzero(np.asarray(episode.truth_mask))[1:]
     nees = np.mean([error[t] @ np.linalg.solve(info.pose_cov[t], error[t]) for t in use]) / 3
-    sized = lambda s: losses.pose_nll(info._replace(pose_cov=s * info.pose_cov), log)
-    best = float(sized(nees))
-    assert best < min(float(sized(nees * 1.05)), float(sized(nees / 1.05)))
+
+    def scaled(factor):
+        return float(losses.pose_nll(info._replace(pose_cov=factor * info.pose_cov), episode))
+
+    assert scaled(nees) < min(scaled(nees * 1.05), scaled(nees / 1.05))
 
 
-def test_likelihood_is_that_of_each_number_observed(run):
-    info, log, _ = run
+def test_innovation_nll_is_per_scalar_measurement(filtered):
+    info, episode, _ = filtered
     right = -np.asarray(info.log_likelihood).sum() / np.asarray(info.dof).sum()
-    np.testing.assert_allclose(losses.innovation_nll(info, log), right)
+    np.testing.assert_allclose(losses.innovation_nll(info, episode), right)
     nothing = info._replace(dof=0 * info.dof, log_likelihood=0 * info.log_likelihood)
-    assert losses.innovation_nll(nothing, log) == 0
+    assert losses.innovation_nll(nothing, episode) == 0
 
 
-def test_a_run_without_truth_costs_nothing(run):
-    info, log, _ = run
-    blind = log._replace(truth_mask=jnp.zeros(T, bool))
+def test_an_episode_without_truth_has_zero_loss(filtered):
+    info, episode, _ = filtered
+    blind = episode._replace(truth_mask=jnp.zeros(T, bool))
     assert losses.pose_mse(info, blind) == 0 and losses.pose_nll(info, blind) == 0
 
 
-def test_a_weighted_sum_is_one(run):
+def test_a_weighted_sum_of_losses_is_a_loss(filtered):
     both = WeightedLoss(((2.0, losses.pose_mse), (0.5, losses.innovation_nll)))
-    right = 2.0 * losses.pose_mse(*run[:2]) + 0.5 * losses.innovation_nll(*run[:2])
-    np.testing.assert_allclose(both(*run[:2]), right)
+    right = 2.0 * losses.pose_mse(*filtered[:2]) + 0.5 * losses.innovation_nll(*filtered[:2])
+    np.testing.assert_allclose(both(*filtered[:2]), right)
     assert hash(both) == hash(WeightedLoss(both.terms)) and losses.needs_truth(both)
     assert not losses.needs_truth(WeightedLoss(((1.0, losses.innovation_nll),)))
-    assert not losses.needs_truth(lambda info, log: info.nis.sum())
+    assert not losses.needs_truth(lambda info, episode: info.nis.sum())
+
+
+def test_losses_have_the_names_that_tune_takes():
+    named = {
+        "pose_nll": losses.pose_nll,
+        "pose_mse": losses.pose_mse,
+        "innovation_nll": losses.innovation_nll,
+    }
+    assert dict(losses.BY_NAME) == named
+    assert [losses.name_of(loss) for loss in named.values()] == list(named)
+    with pytest.raises(ValueError, match="none of pose_nll, pose_mse, innovation_nll"):
+        losses.name_of(print)

@@ -1,0 +1,181 @@
+"""What the filter is called with, checked and converted before anything is compiled.
+
+Shapes and types are checked always, while tracing too; values where they are concrete. Floats
+become those of the belief, whose precision is that of the filter.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.features import Features
+from jaxslam.core.measurement import Measurement, ScanMatch
+from jaxslam.core.types import Array, as_float, check_array
+from jaxslam.filtering.belief import Belief
+from jaxslam.filtering.noise import NoiseParams
+
+# Fields of `Features` that hold floats, with their trailing sizes.
+FLOATS: dict[str, tuple[int, ...]] = {
+    "xy": (2,),
+    "cov": (2, 2),
+    "direction": (),
+    "direction_variance": (),
+    "descriptor": (),
+}
+# The other fields of `Features`, with the kind of numbers they accept and their type.
+OTHERS = {
+    "kind": (jnp.integer, jnp.int32),
+    "degree": (jnp.integer, jnp.int32),
+    "certified": (jnp.bool_, jnp.bool_),
+    "trusted": (jnp.bool_, jnp.bool_),
+    "valid": (jnp.bool_, jnp.bool_),
+}
+MAY_BE_ZERO = ("odometry_coefficients",)  # no error that grows with distance, or with rotation
+
+
+def check_inputs(
+    params: NoiseParams, belief: Belief, measurement: Measurement, *, over_time: bool
+) -> tuple[NoiseParams, Measurement]:
+    """Check what `step` or `run_filter` is called with.
+
+    Args:
+        params: Noise parameters.
+        belief: Belief.
+        measurement: Measurement; records may hold NumPy arrays, lists and JAX arrays.
+        over_time: Whether the measurement leads with T, as of `run_filter`.
+
+    Returns:
+        Noise parameters and measurement as JAX arrays in the belief's precision.
+
+    Raises:
+        ValueError: A record, shape, type or value is wrong, or there is scan matching and
+            `params.scan_match_std_scale` is None; the message states which. The reverse is no
+            error: loop closures use that parameter, too.
+    """
+    _check_record("belief", belief, Belief)
+    check_array("belief.mean", belief.mean, ("D",), jnp.floating)
+    dtype = belief.mean.dtype
+    params = check_params(params, dtype)
+    name = "measurements" if over_time else "measurement"
+    _check_record(name, measurement, Measurement)
+    scan_match = measurement.scan_match
+    if scan_match is not None and params.scan_match_std_scale is None:
+        raise ValueError(f"params.scan_match_std_scale is None, but {name}.scan_match is given")
+    odometry = _floats(f"{name}.odometry", measurement.odometry, ("T", 3)[not over_time :], dtype)
+    lead = odometry.shape[:-1]
+    features = as_features(f"{name}.features", measurement.features, lead, dtype)
+    ids = measurement.landmark_ids
+    if ids is not None:
+        ids = _check_ids(f"{name}.landmark_ids", ids, features, belief.num_seen.size)
+    if scan_match is not None:
+        scan_match = as_scan_match(f"{name}.scan_match", scan_match, lead, dtype)
+    return params, Measurement(odometry, features, ids, scan_match)
+
+
+def check_params(params: NoiseParams, dtype: Any = float) -> NoiseParams:
+    """Check noise parameters, and convert them to JAX arrays.
+
+    Args:
+        params: Noise parameters.
+        dtype: Type of the floats; by default JAX's.
+
+    Raises:
+        ValueError: A shape is wrong, or a value is concrete and not positive and finite; those of
+            `odometry_coefficients` may be 0.
+    """
+    _check_record("params", params, NoiseParams)
+
+    def convert(field: str, value: Any) -> Array | None:
+        if value is None and field == "scan_match_std_scale":
+            return None
+        name = f"params.{field}"
+        array = _floats(name, value, (4,) if field == "odometry_coefficients" else (), dtype)
+        numbers = concrete_values(array)
+        if numbers is not None:
+            in_range = numbers >= 0.0 if field in MAY_BE_ZERO else numbers > 0.0
+            if not np.all(in_range & np.isfinite(numbers)):
+                wanted = "non-negative" if field in MAY_BE_ZERO else "positive"
+                raise ValueError(f"{name} is {numbers.tolist()}, not {wanted} and finite")
+        return array
+
+    return NoiseParams._make(convert(field, value) for field, value in params._asdict().items())
+
+
+def concrete_values(x: Array) -> np.ndarray | None:
+    """Values of an array as NumPy; None while tracing, or where other processes hold some."""
+    if isinstance(x, jax.core.Tracer) or not x.is_fully_addressable:
+        return None
+    return np.asarray(x)
+
+
+def _check_record(name: str, record: Any, kind: type) -> None:
+    """Raise ValueError unless a record is of this kind."""
+    if not isinstance(record, kind):
+        raise ValueError(f"{name} is {type(record).__name__}, not {kind.__name__}")
+
+
+def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any) -> Features:
+    """Features that lead with `lead` and M, checked and converted.
+
+    Args:
+        name: Name of `features`, for messages.
+        features: Features; the fields may be NumPy arrays, lists or JAX arrays.
+        lead: Sizes of the leading axes: (T,), or () for one scan.
+        dtype: Type of the floats.
+
+    Raises:
+        ValueError: A shape or type is wrong, or there is no feature at all (M = 0).
+    """
+    _check_record(name, features, Features)
+    kind = _as_type(f"{name}.kind", features.kind, (*lead, "M"), jnp.integer, jnp.int32)
+    if not kind.shape[-1]:
+        raise ValueError(f"{name} holds no feature, M = 0; give one with valid = False")
+
+    def convert(field: str, value: Any) -> Array:
+        if field in FLOATS:
+            return _floats(f"{name}.{field}", value, kind.shape + FLOATS[field], dtype)
+        return _as_type(f"{name}.{field}", value, kind.shape, *OTHERS[field])
+
+    return Features(*(convert(field, value) for field, value in features._asdict().items()))
+
+
+def as_scan_match(name: str, scan_match: ScanMatch, lead: tuple[int, ...], dtype: Any) -> ScanMatch:
+    """Results of scan matching that lead with `lead`, checked and converted as `as_features`."""
+    _check_record(name, scan_match, ScanMatch)
+    increment, information, inlier_fraction = scan_match
+    return ScanMatch(
+        _floats(f"{name}.increment", increment, (*lead, 3), dtype),
+        _floats(f"{name}.information", information, (*lead, 3, 3), dtype),
+        _floats(f"{name}.inlier_fraction", inlier_fraction, lead, dtype),
+    )
+
+
+def _check_ids(name: str, ids: Any, features: Features, size: int) -> Array:
+    """Known landmarks of the features, of which there are `size` at most."""
+    ids = _as_type(name, ids, features.kind.shape, jnp.integer, jnp.int32)
+    numbers, valid = concrete_values(ids), concrete_values(features.valid)
+    if numbers is not None and valid is not None:
+        used = numbers[valid]
+        if used.size and not -1 <= used.min() <= used.max() < size:
+            wrong = used.max() if used.max() >= size else used.min()
+            wanted = f"-1 or a landmark below the belief's {size} (max_landmarks)"
+            raise ValueError(f"{name} holds {wrong}, not {wanted}")
+    return ids
+
+
+def _floats(name: str, x: Any, shape: tuple[Any, ...], dtype: Any) -> Array:
+    """`as_float` in a given precision."""
+    return as_float(name, x, shape).astype(dtype)
+
+
+def _as_type(name: str, x: Any, shape: tuple[Any, ...], kind: Any, dtype: Any) -> Array:
+    """An array-like as a JAX array, its shape and kind of numbers checked."""
+    if not isinstance(x, jax.Array):
+        try:
+            x = np.asarray(x)
+        except ValueError:
+            raise ValueError(f"{name} is not an array: its parts differ in shape") from None
+    check_array(name, x, shape, kind)
+    return jnp.asarray(x, dtype)

@@ -1,0 +1,113 @@
+"""Arguments of simulations: taken in any form, and checked before anything is compiled.
+
+An argument that is refused raises ValueError, which names it, what was given, and what is expected.
+"""
+
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.types import Array, as_float
+from jaxslam.simulation import worlds
+from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW, densify
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.worlds import World
+
+MIN_PATH_POINTS = 6  # the first and the sixth give the direction in which the drive starts
+MAX_PATH_GAP = 1.0  # [m] between points of a path; of sparser ones the robot cuts the corners
+
+
+def check_key(key: Any) -> None:
+    """Raise ValueError unless this is one key made by `jax.random.key`."""
+    is_key = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if not is_key or key.shape:
+        given = f"{key.dtype} {key.shape}" if isinstance(key, jax.Array) else repr(key)
+        raise ValueError(f"key is {given}, not one key as jax.random.key(seed) makes it")
+
+
+def as_count(name: str, x: Any, *, least: int = 1) -> int:
+    """A whole number of at least `least`; ValueError otherwise."""
+    try:
+        number = operator.index(x)
+    except TypeError:
+        raise ValueError(f"{name} is {x!r}, not a whole number") from None
+    if number < least:
+        raise ValueError(f"{name} is {number}; it must be {least} or more")
+    return number
+
+
+def as_robot(robot: Any) -> Robot:
+    """The robot with Python's floats, so that it is static under jit.
+
+    Raises:
+        ValueError: It is no `Robot`, or has no possible size or noise.
+    """
+    if not isinstance(robot, Robot):
+        raise ValueError(f"robot is {type(robot).__name__}, not Robot")
+    robot = Robot(*(float(x) for x in robot))
+    if not 0.0 < robot.wheel_base < np.inf:
+        raise ValueError(f"robot.wheel_base is {robot.wheel_base}, not above 0")
+    if not 0.0 <= robot.encoder_noise < np.inf:
+        raise ValueError(f"robot.encoder_noise is {robot.encoder_noise}, not 0 or more")
+    return robot
+
+
+def as_world(world: Any) -> World:
+    """A world in JAX's precision, of its name or of walls.
+
+    Raises:
+        ValueError: There is no world of this name, or the walls are not (S, 4) finite numbers.
+    """
+    if isinstance(world, str):
+        return World(jnp.asarray(worlds.named(world).walls, float))
+    if not isinstance(world, World):
+        raise ValueError(
+            f"world is {type(world).__name__}, not World or one of the names "
+            f"{', '.join(worlds.NAMES)}"
+        )
+    walls = as_float("world.walls", world.walls, ("S", 4))
+    if not np.isfinite(walls).all():
+        raise ValueError("world.walls holds numbers that are not finite")
+    return World(walls)
+
+
+def as_path(path: Any, world: Any) -> Array:
+    """A path (N, 2) [m] in JAX's precision.
+
+    Args:
+        path: Its points; None for the drive that belongs to the world.
+        world: Name of the world, or `World`.
+
+    Raises:
+        ValueError: The points are not finite, too few, or too far apart or too close together to be
+            followed; or there is no path, and the world has none of its own.
+    """
+    if path is None:
+        if not isinstance(world, str):
+            raise ValueError("path is None; a world without a name has no drive of its own")
+        return jnp.asarray(densify(worlds.waypoints(world)), float)
+    points = as_float("path", path, ("N", 2))
+    check_path(points)
+    if not np.isfinite(points).all():
+        raise ValueError("path holds numbers that are not finite")
+    gaps = np.hypot(*np.diff(np.asarray(points, float), axis=0).T)
+    advice = "make it of waypoints by jaxslam.simulation.path_following.densify"
+    if gaps.max() > MAX_PATH_GAP:
+        raise ValueError(
+            f"path has points {gaps.max():.2f} m apart; at most {MAX_PATH_GAP} m: {advice}"
+        )
+    if gaps.sum() > LOOKAHEAD > np.median(gaps) * (SEARCH_WINDOW - 1):
+        raise ValueError(
+            f"path has points {np.median(gaps):.4f} m apart; {SEARCH_WINDOW} of them must span "
+            f"{LOOKAHEAD} m: {advice}"
+        )
+    return points
+
+
+def check_path(path: Array) -> None:
+    """Raise ValueError if a path (N, 2) has too few points to start along; while tracing, too."""
+    if path.ndim != 2 or path.shape[1] != 2 or path.shape[0] < MIN_PATH_POINTS:
+        raise ValueError(f"path is {path.shape}, not (N >= {MIN_PATH_POINTS}, 2)")

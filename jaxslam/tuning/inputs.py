@@ -1,0 +1,188 @@
+"""Checks of what this package is given: configuration, noise, episodes. Nothing is compiled yet."""
+
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.episode import Episode
+from jaxslam.core.features import Features
+from jaxslam.core.measurement import ScanMatch
+from jaxslam.core.types import as_float, check_array
+from jaxslam.filtering.inputs import FLOATS, OTHERS
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline.config import Config
+from jaxslam.tuning.losses import Loss, check_loss
+
+SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
+    "increment": (3,),
+    "information": (3, 3),
+    "inlier_fraction": (),
+}
+"""Sizes after B and T of each field of `ScanMatch`, in its order; all are floats."""
+
+
+def prepare(
+    config: Config, params: NoiseParams, episodes: Episode, loss: Loss, *, name: str = "episodes"
+) -> tuple[NoiseParams, Episode]:
+    """Noise and episodes as arrays; ValueError unless all that the filter needs fits together.
+
+    The values of the noise are not looked at: an optimiser may propose some that overflow, whose
+    loss is not finite.
+    """
+    check_type("config", config, Config)
+    params, episodes = as_params(params, positive=False), as_episodes(episodes, name=name)
+    check_loss(loss, episodes, name=name)
+    check_scan_matching(params, episodes, name=name)
+    capacity, ids = config.filter.max_landmarks, episodes.landmark_ids
+    if ids is not None and np.max(ids, initial=-1) >= capacity:
+        raise ValueError(
+            f"{name}.landmark_ids holds {np.max(ids)}, but config.filter.max_landmarks is "
+            f"{capacity}: ids are 0 to max_landmarks - 1"
+        )
+    return params, episodes
+
+
+def check_type(name: str, x: Any, wanted: type) -> None:
+    """Raise ValueError unless an argument is a record of this type."""
+    if not isinstance(x, wanted):
+        swapped = wanted in (Config, NoiseParams, Episode)  # the usual cause
+        order = "; the order is config, params, episodes" if swapped else ""
+        raise ValueError(f"{name} is {type(x).__name__}, not {wanted.__name__}{order}")
+
+
+def as_params(params: NoiseParams, *, positive: bool = True) -> NoiseParams:
+    """Noise parameters as JAX arrays of the default float type, checked.
+
+    Args:
+        params: Numbers, lists, NumPy or JAX arrays; `scan_match_std_scale` may be None.
+        positive: Whether the values are checked, too.
+
+    Raises:
+        ValueError: It is no `NoiseParams`, or a field has not its shape or is not finite and
+            positive.
+    """
+    check_type("params", params, NoiseParams)
+    arrays = {}
+    for field, x in params._asdict().items():
+        if x is None and field == "scan_match_std_scale":
+            continue
+        shape = (4,) if field == "odometry_coefficients" else ()
+        arrays[field] = jnp.asarray(as_float(f"params.{field}", x, shape), float)
+        if positive and not isinstance(x, jax.core.Tracer):
+            numbers = np.asarray(x, np.float64)
+            if not (np.isfinite(numbers) & (numbers > 0.0)).all():
+                raise ValueError(f"params.{field} is {numbers.tolist()}, not positive and finite")
+    return params._replace(scan_match_std_scale=None)._replace(**arrays)
+
+
+def as_episodes(episodes: Episode, *, name: str = "episodes") -> Episode:
+    """Episodes [B] as arrays, floats in JAX's default precision, checked; values are not looked at.
+
+    Args:
+        episodes: [B] NumPy arrays, JAX arrays or lists; arrays that need no change are not copied.
+        name: What they are called in the error message.
+
+    Raises:
+        ValueError: It is no `Episode`, or a field has another shape or kind than it should.
+    """
+    check_type(name, episodes, Episode)
+    check_type(f"{name}.features", episodes.features, Features)
+    odometry = _convert(f"{name}.odometry", episodes.odometry, ("B", "T", 3), jnp.floating)
+    b, t = odometry.shape[:2]
+    kind = _convert(f"{name}.features.kind", episodes.features.kind, (b, t, "M"), jnp.integer)
+    m = kind.shape[2]
+
+    if not m:
+        raise ValueError(f"{name}.features holds no feature, M = 0; give one with valid = False")
+
+    def feature(field: str, x: Any) -> Any:
+        shape = (b, t, m, *FLOATS.get(field, ()))
+        family = jnp.floating if field in FLOATS else OTHERS[field][0]
+        return _convert(f"{name}.features.{field}", x, shape, family)
+
+    def optional(field: str, shape: tuple[int, ...], family: Any) -> Any:
+        x = getattr(episodes, field)
+        return None if x is None else _convert(f"{name}.{field}", x, shape, family)
+
+    matches = episodes.scan_matches
+    if matches is not None:
+        check_type(f"{name}.scan_matches", matches, ScanMatch)
+        matches = ScanMatch(
+            *(
+                _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
+                for (field, sizes), x in zip(SCAN_MATCH_FIELDS.items(), matches, strict=True)
+            )
+        )
+    return Episode(
+        truth=_convert(f"{name}.truth", episodes.truth, (b, t, 3), jnp.floating),
+        odometry=odometry,
+        features=Features(*map(feature, Features._fields, episodes.features)),
+        landmark_ids=optional("landmark_ids", (b, t, m), jnp.integer),
+        truth_mask=optional("truth_mask", (b, t), jnp.bool_),
+        num_steps=optional("num_steps", (b,), jnp.integer),
+        scan_matches=matches,
+    )
+
+
+def _convert(name: str, x: Any, shape: tuple[Any, ...], family: Any) -> Any:
+    """An array of this shape and family of dtypes; one of NumPy stays one, a list becomes one."""
+    if not isinstance(x, jax.Array | np.ndarray):
+        try:
+            x = np.asarray(x)
+        except ValueError:
+            raise ValueError(f"{name} is not an array: its parts differ in shape") from None
+    is_integer = jnp.issubdtype(x.dtype, jnp.integer)
+    wanted = x.dtype
+    if family is jnp.floating and (is_integer or jnp.issubdtype(x.dtype, jnp.floating)):
+        wanted = jnp.zeros(()).dtype
+    elif family is jnp.integer and is_integer:
+        wanted = np.dtype(np.int32)
+    x = x if x.dtype == wanted else x.astype(wanted)
+    check_array(name, x, shape, family)
+    return x
+
+
+def check_scan_matching(params: NoiseParams, episodes: Episode, *, name: str = "episodes") -> None:
+    """Raise ValueError unless there is a factor on scan matching where there are scan matches."""
+    matched = episodes.scan_matches is not None
+    if matched and params.scan_match_std_scale is None:
+        raise ValueError(
+            f"params.scan_match_std_scale is None, but {name}.scan_matches are given; start from "
+            "NoiseParams.for_laser_log(match_scans=True)"
+        )
+    if not matched and params.scan_match_std_scale is not None:
+        raise ValueError(
+            f"params.scan_match_std_scale is given, but {name}.scan_matches is None; give None, too"
+        )
+
+
+def check_alike(episodes: Episode, heldout: Episode) -> None:
+    """Raise ValueError unless held-out episodes are of the kind of those to tune on.
+
+    They have the same fields and the same number M of features a step; B and T may differ.
+    """
+    for field in ("landmark_ids", "scan_matches"):
+        ours, other = (getattr(part, field) is None for part in (episodes, heldout))
+        if ours != other:
+            without, given = ("episodes", "heldout") if ours else ("heldout", "episodes")
+            raise ValueError(f"{without}.{field} is None, but {given}.{field} is not")
+    m, other_m = (part.features.kind.shape[2] for part in (episodes, heldout))
+    if m != other_m:
+        raise ValueError(
+            f"heldout has M = {other_m} features a step, episodes has {m}; pad them alike, as "
+            "stack_episodes does"
+        )
+
+
+def check_count(name: str, x: Any, least: int) -> int:
+    """An integer of at least `least`; ValueError otherwise."""
+    try:
+        number = operator.index(x)
+    except TypeError:
+        raise ValueError(f"{name} is {x!r}, not an integer") from None
+    if number < least:
+        raise ValueError(f"{name} is {number}; it must be {least} or more")
+    return number

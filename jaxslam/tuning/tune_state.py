@@ -1,0 +1,146 @@
+"""State and result of a tuning: what is recorded, which evaluation is best, when it stops."""
+
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.tuning.inputs import as_params, check_type
+from jaxslam.tuning.parameters import constrain, trainable_mask
+
+
+class TuneState(NamedTuple):
+    """State of a tuning, with all that it needs to continue. P parameters, N updates in all.
+
+    Attributes:
+        step: () int64 number of evaluations so far.
+        theta: (P,) float64 logarithms of the noise to be evaluated next.
+        optimizer_state: State of the optimiser, of the free parameters.
+        theta_history: (N + 1, P) float64 logarithms that each evaluation used; NaN: not yet.
+        loss: (N + 1,) float64 mean over the episodes of each evaluation; NaN: not yet.
+        heldout: (N + 1,) float64 mean over the held-out episodes; NaN: not evaluated.
+        skipped: (N + 1,) int64 episodes left out of the mean because a value was not finite.
+    """
+
+    step: np.int64
+    theta: np.ndarray
+    optimizer_state: Any
+    theta_history: np.ndarray
+    loss: np.ndarray
+    heldout: np.ndarray
+    skipped: np.ndarray
+
+
+class TuneResult(NamedTuple):
+    """Result of `tune`. N evaluations: one more than updates, or fewer when it stopped early.
+
+    Attributes:
+        params: The best noise.
+        best: Number of the evaluation it is from.
+        loss: (N,) mean over the episodes of each evaluation.
+        heldout: (N,) mean over the held-out episodes; NaN where not evaluated.
+        history: [N] noise that each evaluation used.
+        skipped: (N,) episodes left out of the mean because a value was not finite.
+    """
+
+    params: NoiseParams
+    best: int
+    loss: np.ndarray
+    heldout: np.ndarray
+    history: NoiseParams
+    skipped: np.ndarray
+
+
+def init(
+    params: NoiseParams,
+    *,
+    num_updates: int,
+    optimizer: optax.GradientTransformation,
+    frozen: Collection[str] = (),
+) -> TuneState:
+    """The state before the first evaluation; the arguments are those of `tune`.
+
+    Raises:
+        ValueError: The noise is not positive, or a parameter's name is unknown.
+    """
+    start = np.asarray(ravel_pytree(as_params(params))[0], np.float64)
+    theta, not_yet = np.log(start), np.full(num_updates + 1, np.nan)
+    return TuneState(
+        step=np.int64(0),
+        theta=theta,
+        optimizer_state=optimizer.init(jnp.asarray(theta[trainable_mask(params, frozen)])),
+        theta_history=np.full((num_updates + 1, theta.size), np.nan),
+        loss=not_yet,
+        heldout=not_yet,
+        skipped=np.zeros(num_updates + 1, np.int64),
+    )
+
+
+def check_state(state: TuneState, num_params: int, num_updates: int) -> None:
+    """Raise ValueError unless a state is one of a tuning of P parameters by N updates."""
+    check_type("state", state, TuneState)
+    shape = np.shape(state.theta_history)
+    if shape != (num_updates + 1, num_params):
+        raise ValueError(
+            f"state is of {shape[0] - 1} updates of {shape[1]} parameters, not of {num_updates} of "
+            f"{num_params}"
+        )
+
+
+def result(state: TuneState, params: NoiseParams, *, whole: bool = True) -> TuneResult:
+    """Result of the evaluations so far.
+
+    Args:
+        state: After one evaluation at least.
+        params: Any noise with the same parameters, for its fields and precision.
+        whole: Whether each step evaluated all episodes, so that their losses are comparable.
+    """
+    count = int(state.step)
+    like, unravel = ravel_pytree(params)
+    thetas = jnp.asarray(state.theta_history[:count], like.dtype)
+    best = _best(state, whole)
+    return TuneResult(
+        params=constrain(unravel(thetas[best])),
+        best=best,
+        loss=state.loss[:count],
+        heldout=state.heldout[:count],
+        history=constrain(jax.vmap(unravel)(thetas)),
+        skipped=state.skipped[:count],
+    )
+
+
+def record(state: TuneState, value: float, validation: float, skipped: int) -> TuneState:
+    """Record an evaluation; the arrays of the state before are not changed."""
+
+    def put(old: np.ndarray, new: Any) -> np.ndarray:
+        changed = np.array(old)
+        changed[state.step] = new
+        return changed
+
+    return state._replace(
+        step=state.step + 1,
+        theta_history=put(state.theta_history, state.theta),
+        loss=put(state.loss, value),
+        heldout=put(state.heldout, validation),
+        skipped=put(state.skipped, skipped),
+    )
+
+
+def _best(state: TuneState, whole: bool) -> int:
+    """Number of the best evaluation: by held-out loss, else by comparable losses, else the last."""
+    for series in (state.heldout, state.loss) if whole else (state.heldout,):
+        if np.isfinite(series).any():
+            return int(np.nanargmin(series))
+    return int(state.step) - 1
+
+
+def stalled(state: TuneState, patience: int | None) -> bool:
+    """Whether the best validation is `patience` or more validations ago."""
+    validations = state.heldout[np.isfinite(state.heldout)]
+    since_best = len(validations) - 1 - np.argmin([*validations, np.inf])
+    return patience is not None and bool(since_best >= patience)

@@ -1,0 +1,126 @@
+import os
+import re
+import subprocess
+import sys
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam.core.devices import DeviceMap, _run, use_cpu_devices
+
+
+def assert_same(one, two):
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+
+
+def items(count):
+    return {"a": jnp.arange(3.0 * count).reshape(count, 3), "b": jnp.arange(count)}
+
+
+def scaled(power, common, item):
+    return jax.tree.map(lambda x: common["by"] * jnp.sin(x.astype(float)) ** power, item)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 16, 19])
+@pytest.mark.parametrize("devices", [1, 2])
+def test_a_device_map_equals_vmap_on_any_number_of_devices(count, devices):
+    common = {"by": jnp.float64(1.7)}
+    device_map = DeviceMap(scaled, size=4, static=1)
+    found = device_map(3, common, items(count), devices=jax.devices()[:devices])
+    assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(found))
+    expected = jax.vmap(lambda item: scaled(3, common, item))(items(count))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), found, expected)
+
+
+def test_bits_do_not_depend_on_the_number_of_items_or_devices():
+    common = {"by": jnp.float64(1.7)}
+    device_map = DeviceMap(scaled, size=4, static=1)
+    many = device_map(2, common, items(19))
+    few = device_map(2, common, items(9), devices=jax.devices()[:1])
+    assert_same(jax.tree.map(lambda x: x[:9], many), few)
+
+
+def test_single_items_are_not_vectorised():
+    """A condition of one item stays a branch: of a batch, both branches would be computed."""
+
+    def signed(common, item):
+        return jax.lax.cond(item > 0, lambda: common, lambda: -common)
+
+    for size, word in [(1, "cond"), (2, "select")]:
+        program = _run.trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr
+        assert word in str(program)
+    assert DeviceMap(signed, size=1)(jnp.float64(2.0), jnp.array([1, 0, 3])).tolist() == [2, -2, 2]
+
+
+def test_work_begins_before_its_results_are_waited_for():
+    device_map = DeviceMap(scaled, size=2, static=1)
+    common = {"by": jnp.float64(1.7)}
+    finish = [device_map.begin(2, common, items(count)) for count in (3, 7)]
+    for one, count in zip(finish, (3, 7), strict=True):
+        assert_same(one(), device_map(2, common, items(count)))
+
+
+USE = "import os, jax; from jaxslam.core import devices; devices.use_cpu_devices({}); "
+PRINT = "print(jax.device_count(), os.environ.get('XLA_FLAGS', ''))"
+
+
+def output_of(code, **own):
+    keep = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    run = partial(subprocess.run, capture_output=True, text=True, timeout=60, check=True)
+    return run([sys.executable, "-c", code], env=keep | own).stdout.split()
+
+
+@pytest.mark.timeout(120)
+def test_every_core_is_a_device_by_default():
+    whole = "--xla_disable_hlo_passes=cpu-parallel-task-assigner"
+    three = "--xla_force_host_platform_device_count=3"
+    assert output_of(USE.format(3) + PRINT) == ["3", three, whole]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    assert output_of(USE.format("") + PRINT)[0] == str(cores)
+    # Flags of the user are kept, and so are backends that have started.
+    assert output_of(USE.format(2) + PRINT, XLA_FLAGS=three) == ["3", three, whole]
+    assert output_of("import jax; jax.devices(); " + USE.format(3) + PRINT) == ["1"]
+    flags = "print(os.environ.get('XLA_FLAGS', '-'))"
+    assert output_of(USE.format(3) + flags, JAX_PLATFORMS="tpu") == ["-"]
+
+
+def test_a_device_map_traces_once_whatever_the_number_of_batches():
+    traces = []
+
+    def counted(common, item):
+        traces.append(1)
+        return common * item
+
+    device_map = DeviceMap(counted, size=2)
+    for _ in range(3):
+        device_map(jnp.float64(2.0), jnp.arange(8.0))
+    assert len(traces) == 1
+
+
+def square(common, item):
+    return common * item**2
+
+
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray])
+def test_items_may_be_arrays_of_numpy_or_jax(kind):
+    found = DeviceMap(square, size=2)(kind(2.0), kind([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(found, [2.0, 8.0, 18.0])
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: DeviceMap(square, size=0), "size is 0, not 1 or more"),
+        (lambda: DeviceMap(square, size=2, static=-1), "static is -1, not 0 or more"),
+        (lambda: DeviceMap(square, size=2)(np.zeros(3)), "1 arguments, not 0 static ones, the com"),
+        (lambda: DeviceMap(square, size=2)(2.0, np.zeros(0)), "items is empty"),
+        (lambda: DeviceMap(square, size=2)(2.0, [np.zeros(2), np.zeros(3)]), "lengths: [2, 3]"),
+        (lambda: use_cpu_devices(0), "num_devices is 0, not 1 or more"),
+    ],
+)
+def test_impossible_arguments_are_refused(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()

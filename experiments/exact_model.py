@@ -44,12 +44,12 @@ CONFIG = Config(
 def true_params() -> NoiseParams:
     """Q and R that the drives are simulated with."""
     return NoiseParams(
-        wheel_coefficients(*Robot()),
-        range_std=0.01,
-        bearing_std=0.005,
-        feature_std_scale=1.0,
-        wall_angle_std=0.002,
-    ).as_arrays()
+        odometry_coefficients=jnp.asarray(wheel_coefficients(*Robot()), float),
+        range_std=jnp.asarray(0.01, float),
+        bearing_std=jnp.asarray(0.005, float),
+        feature_std_scale=jnp.asarray(1.0, float),
+        wall_angle_std=jnp.asarray(0.002, float),
+    )
 
 
 def landmark_positions() -> np.ndarray:

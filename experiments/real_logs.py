@@ -238,7 +238,8 @@ def compute(folder: Path | None, with_tuning: bool, cache: common.ResultCache) -
                 found = cache(f"{log.name} {odometry}", partial(tune, others, odometry))["noise"]
                 if found is not None:
                     values = (found[name] for name in NoiseParams._fields)
-                    noises["tuned"] = NoiseParams(*values).as_arrays()
+                    tuned = (x if x is None else jnp.asarray(x, float) for x in values)
+                    noises["tuned"] = NoiseParams(*tuned)
             for landmarks, (name, params) in product(LANDMARKS, noises.items()):
                 numbers, positions = row(log, own, odometry, landmarks, params)
                 about = {"log": log.name, "odometry": odometry, "landmarks": landmarks}

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from experiments import common, thinning
 from experiments.viewpoints import (
+    AnyWorld,
     CellWorld,
     Viewpoints,
     WallWorld,
@@ -223,7 +224,7 @@ def sample_worlds(seed: int, plans: int, pairs: int) -> tuple[Worlds, dict[str, 
     """Viewpoints in each world, and why a world is left out."""
     rng, config = np.random.default_rng(seed), DEFAULT.config
 
-    def sample(world: WallWorld | CellWorld, count: int) -> Viewpoints:
+    def sample(world: AnyWorld, count: int) -> Viewpoints:
         return sample_viewpoints(config, world, rng, count, MAX_DISTANCE)
 
     keys = tqdm(jax.random.split(jax.random.key(seed), plans), unit="plan", leave=False)

@@ -187,9 +187,10 @@ def main(argv: list[str] | None = None) -> int:
     enable_caches()
     about = {key: str(value) for key, value in vars(args).items() if key != "out"}
     cache = common.ResultCache(args.out / f"{NAME}_parts", about)
+    robots = recorded(Path(args.mrclam)) if args.mrclam else None  # first, as it may be refused
     tasks = {"office": office(args.seed, args.runs, args.heldout)}
-    if args.mrclam:
-        tasks["mrclam"] = recorded(Path(args.mrclam))
+    if robots is not None:
+        tasks["mrclam"] = robots
     rows, traces = [], {}
     for data, task in tasks.items():
         more, traces[data] = compare(data, task, args.seed, NUM_UPDATES[data], cache)

@@ -165,6 +165,9 @@ def _junctions(free: np.ndarray) -> np.ndarray:
     return vertices[inside & (np.min(gaps, axis=0) > MIN_FOOT_ANGLE)]
 
 
+AnyWorld = WallWorld | CellWorld
+
+
 class Viewpoints(NamedTuple):
     """Pairs of viewpoints in a world, and their exact scans.
 
@@ -175,7 +178,7 @@ class Viewpoints(NamedTuple):
         corners: (2 N, C) bool, visible corners of the world.
     """
 
-    world: WallWorld | CellWorld
+    world: AnyWorld
     poses: np.ndarray
     ranges: np.ndarray
     corners: np.ndarray
@@ -188,7 +191,7 @@ class Viewpoints(NamedTuple):
 
 def sample_viewpoints(
     config: FrontendConfig,
-    world: WallWorld | CellWorld,
+    world: AnyWorld,
     rng: np.random.Generator,
     pairs: int,
     max_distance: float,
@@ -240,7 +243,7 @@ def in_view(config: FrontendConfig, poses: np.ndarray, points: np.ndarray) -> np
 
 def visible_circles(
     config: FrontendConfig,
-    world: WallWorld | CellWorld,
+    world: AnyWorld,
     poses: np.ndarray,
     centres: np.ndarray,
     radii: np.ndarray,

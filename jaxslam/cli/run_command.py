@@ -96,7 +96,7 @@ def run(
         config.check()
         increments = arguments.as_log_odometry(increments_of(odom_poses))
         scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
-        arguments.as_scans(config.frontend.lidar, scans, len(increments))
+        arguments.as_scans(config.frontend.lidar, laser_log.ranges, len(increments))
     with name_errors(str(reference)):
         dead_reckoning = log_errors.errors_against(laser_log, odom_poses, known, None)
     with name_errors(str(relations)):

@@ -19,6 +19,8 @@ def stack_episodes(episodes: Sequence[Episode]) -> Episode:
     Raises:
         ValueError: There are none, or some have `landmark_ids` or `scan_matches` and others do not.
     """
+    if isinstance(episodes, Episode) or not all(isinstance(one, Episode) for one in episodes):
+        raise ValueError("episodes is not a list of records of type Episode")
     if not len(episodes):
         raise ValueError("episodes is empty")
     for name in ("landmark_ids", "scan_matches"):

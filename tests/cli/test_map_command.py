@@ -140,7 +140,7 @@ def test_map_refuses_what_is_no_map(refused, tmp_path):
 
 
 def test_map_refuses_a_map_without_free_space(refused, tmp_path):
-    assert "a.yaml: no free space" in refused(write_map(tmp_path, np.zeros((9, 9), bool)))
+    assert "a.yaml: has no free space" in refused(write_map(tmp_path, np.zeros((9, 9), bool)))
     assert "5 m" in refused(write_map(tmp_path), "--robot-radius", 5.0)
 
 

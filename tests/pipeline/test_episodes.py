@@ -306,6 +306,9 @@ def test_stacked_padding_is_blank(pair):
 def test_episodes_of_different_kinds_are_not_stacked(pair, scan_log):
     with pytest.raises(ValueError, match="episodes is empty"):
         episodes.stack_episodes([])
+    for wrong in (pair[0][0], [1]):
+        with pytest.raises(ValueError, match="not a list of records of type Episode"):
+            episodes.stack_episodes(wrong)
     for mixed in ([pair[0][0], scan_log[0]], [scan_log[0], pair[0][0]]):
         with pytest.raises(ValueError, match="with and without `landmark_ids`"):
             episodes.stack_episodes(mixed)

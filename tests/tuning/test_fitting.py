@@ -12,7 +12,7 @@ from jaxslam.tuning.losses import WeightedLoss, check_loss, innovation_nll, pose
 from jaxslam.tuning.tune_state import TuneState
 
 B, STEPS = 8, 12
-CONFIG, TRUTH = exact_model.CONFIG, exact_model.truth()
+CONFIG, TRUTH = exact_model.CONFIG, exact_model.true_params()
 LOSS = WeightedLoss(((3.0, pose_mse), (1.0, innovation_nll), (0.2, pose_nll)))
 P = len(parameters.param_names(TRUTH))
 OFF = parameters.constrain(jax.tree.map(lambda x: x + 0.7, parameters.unconstrain(TRUTH)))
@@ -36,7 +36,7 @@ def flat(noise):
 
 @pytest.fixture(scope="module")
 def episodes():
-    return exact_model.drives(jax.random.key(3), TRUTH, runs=B, steps=STEPS)
+    return exact_model.drives(jax.random.key(3), TRUTH, num_trials=B, num_scans=STEPS)
 
 
 def tuned(episodes, **changes):
@@ -71,7 +71,7 @@ def test_gradients_agree_with_finite_differences(episodes):
 
 def test_the_likelihood_is_stationary_at_the_true_parameters():
     """The score has mean zero at the truth; 4.5 standard errors."""
-    many = exact_model.drives(jax.random.key(4), TRUTH, runs=64, steps=30)
+    many = exact_model.drives(jax.random.key(4), TRUTH, num_trials=64, num_scans=30)
     _, each = fitting.gradients(CONFIG, TRUTH, many, innovation_nll)
     z = each.mean(axis=0) / (each.std(axis=0, ddof=1) / np.sqrt(len(each)))
     assert np.abs(z).max() < 4.5, z

@@ -19,6 +19,7 @@ from jaxslam.filtering.config import FilterConfig, confirmed
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching.loop_closure import LoopClosures
+from jaxslam.smoothing.problem import ODOMETRY_STD_FLOOR
 
 
 class PoseGraph(NamedTuple):
@@ -49,10 +50,6 @@ class PoseGraph(NamedTuple):
     closure_ends: np.ndarray = np.zeros((0, 2), int)
     closure_pose: np.ndarray = np.zeros((0, 3))
     closure_information: np.ndarray = np.zeros((0, 3, 3))
-
-
-# [m], [rad] standard deviation added to each odometry increment: that of a robot at rest has none.
-ODOMETRY_STD_FLOOR = 1e-4
 
 
 @partial(trace_cache.jit, static_argnames="config")

@@ -58,27 +58,27 @@ _GRADIENTS = DeviceMap(_value_and_gradient, size=EPISODE_BATCH, static=2)
 
 
 def values(
-    config: Config, params: NoiseParams, episodes: Episode, loss: Loss = pose_nll
+    config: Config, params: NoiseParams, episodes: Episode, loss: Loss | str = pose_nll
 ) -> np.ndarray:
     """Loss (B,) float64 of each episode [B].
 
     Raises:
         ValueError: As `tune`.
     """
-    params, episodes = prepare(config, params, episodes, loss)
-    return np.asarray(_VALUES(config, loss, unconstrain(params), episodes), np.float64)
+    params, stacked, function = prepare(config, params, episodes, loss)
+    return np.asarray(_VALUES(config, function, unconstrain(params), stacked), np.float64)
 
 
 def gradients(
-    config: Config, params: NoiseParams, episodes: Episode, loss: Loss = pose_nll
+    config: Config, params: NoiseParams, episodes: Episode, loss: Loss | str = pose_nll
 ) -> tuple[np.ndarray, np.ndarray]:
     """Loss (B,) of each episode and its gradient (B, P) in the logarithms of the noise, float64.
 
     Raises:
         ValueError: As `tune`.
     """
-    params, episodes = prepare(config, params, episodes, loss)
-    value, gradient = _GRADIENTS(config, loss, unconstrain(params), episodes)
+    params, stacked, function = prepare(config, params, episodes, loss)
+    value, gradient = _GRADIENTS(config, function, unconstrain(params), stacked)
     return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
 
 
@@ -110,15 +110,15 @@ def draw_batch(seed: int, step: int, num_episodes: int, batch_size: int) -> np.n
 def tune(
     config: Config,
     params: NoiseParams,
-    episodes: Episode,
+    episodes: Episode | list[Episode],
     *,
-    loss: Loss = pose_nll,
+    loss: Loss | str = pose_nll,
     optimizer: optax.GradientTransformation | None = None,
     num_updates: int = 30,
     batch_size: int | None = None,
     seed: int = 0,
     frozen: Collection[str] = (),
-    heldout: Episode | None = None,
+    heldout: Episode | list[Episode] | None = None,
     evaluate_every: int = 1,
     patience: int | None = None,
     state: TuneState | None = None,
@@ -139,9 +139,9 @@ def tune(
     Args:
         config: Its filter is the one that is tuned.
         params: Where to start.
-        episodes: [B] training episodes.
-        loss: Its mean over episodes is minimised; one of `losses`, or any function of the step
-            infos of the filter on an episode, and the episode.
+        episodes: [B] training episodes, or a list of single ones.
+        loss: Its mean over episodes is minimised; one of `losses`, also by its name, or any
+            function of the step infos of the filter on an episode, and the episode.
         optimizer: Of the logarithms of the free parameters; `optimizers.default_optimizer` by
             default.
         num_updates: Number of updates.
@@ -167,15 +167,16 @@ def tune(
             given, and no `scan_match_std_scale`; held-out episodes have other fields; a
             parameter's name is unknown; a number is out of range; the state is of another call.
     """
-    params, episodes = prepare(config, params, episodes, loss)
+    params, training, function = prepare(config, params, episodes, loss)
     params = as_params(params)
+    validation = None
     if heldout is not None:
-        heldout = prepare(config, params, heldout, loss, name="heldout")[1]
-        check_alike(episodes, heldout)
+        validation = prepare(config, params, heldout, loss, name="heldout")[1]
+        check_alike(training, validation)
     num_updates, seed = check_count("num_updates", num_updates, 0), check_count("seed", seed, 0)
     check_count("evaluate_every", evaluate_every, 1)
     check_count("patience", 1 if patience is None else patience, 1)
-    trainable, count = trainable_mask(params, frozen), episodes.odometry.shape[0]
+    trainable, count = trainable_mask(params, frozen), training.odometry.shape[0]
     size = count if batch_size is None else min(count, check_count("batch_size", batch_size, 1))
     whole = size == count
     if optimizer is None:
@@ -187,12 +188,12 @@ def tune(
 
     while state.step <= num_updates and not stalled(state, patience):
         current, step = unflatten_params(state.theta, params), int(state.step)
-        training = episodes if whole else _take(draw_batch(seed, step, count, size), episodes)
-        value, gradient, skipped = mean_gradient(*gradients(config, current, training, loss))
-        validation = np.nan
-        if heldout is not None and (step % evaluate_every == 0 or step == num_updates):
-            validation = _finite_mean(values(config, current, heldout, loss))
-        state = record(state, value, validation, skipped)
+        batch = training if whole else _take(draw_batch(seed, step, count, size), training)
+        value, gradient, skipped = mean_gradient(*gradients(config, current, batch, function))
+        heldout_loss = np.nan
+        if validation is not None and (step % evaluate_every == 0 or step == num_updates):
+            heldout_loss = _finite_mean(values(config, current, validation, function))
+        state = record(state, value, heldout_loss, skipped)
         state = _update_theta(state, optimizer, value, gradient, trainable)
         if callback is not None:
             callback(state)

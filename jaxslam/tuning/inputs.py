@@ -14,7 +14,8 @@ from jaxslam.core.types import as_float, check_array
 from jaxslam.filtering.inputs import FLOATS, OTHERS
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
-from jaxslam.tuning.losses import Loss, check_loss
+from jaxslam.pipeline.stacking import stack_episodes
+from jaxslam.tuning.losses import Loss, check_loss, resolve
 
 SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
     "increment": (3,),
@@ -25,24 +26,30 @@ SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
 
 
 def prepare(
-    config: Config, params: NoiseParams, episodes: Episode, loss: Loss, *, name: str = "episodes"
-) -> tuple[NoiseParams, Episode]:
-    """Noise and episodes as arrays; ValueError unless all that the filter needs fits together.
+    config: Config,
+    params: NoiseParams,
+    episodes: Episode | list[Episode],
+    loss: Loss | str,
+    *,
+    name: str = "episodes",
+) -> tuple[NoiseParams, Episode, Loss]:
+    """Noise and episodes as arrays, and the loss; ValueError unless all fits together.
 
     The values of the noise are not looked at: an optimiser may propose some that overflow, whose
     loss is not finite.
     """
     check_type("config", config, Config)
-    params, episodes = as_params(params, positive=False), as_episodes(episodes, name=name)
-    check_loss(loss, episodes, name=name)
-    check_scan_matching(params, episodes, name=name)
-    capacity, ids = config.filter.max_landmarks, episodes.landmark_ids
+    params, stacked = as_params(params, positive=False), as_episodes(episodes, name=name)
+    function = resolve(loss)
+    check_loss(function, stacked, name=name)
+    check_scan_matching(params, stacked, name=name)
+    capacity, ids = config.filter.max_landmarks, stacked.landmark_ids
     if ids is not None and np.max(ids, initial=-1) >= capacity:
         raise ValueError(
             f"{name}.landmark_ids holds {np.max(ids)}, but config.filter.max_landmarks is "
             f"{capacity}: ids are 0 to max_landmarks - 1"
         )
-    return params, episodes
+    return params, stacked, function
 
 
 def check_type(name: str, x: Any, wanted: type) -> None:
@@ -78,17 +85,21 @@ def as_params(params: NoiseParams, *, positive: bool = True) -> NoiseParams:
     return params._replace(scan_match_std_scale=None)._replace(**arrays)
 
 
-def as_episodes(episodes: Episode, *, name: str = "episodes") -> Episode:
+def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") -> Episode:
     """Episodes [B] as arrays, floats in JAX's default precision, checked; values are not looked at.
 
     Args:
         episodes: [B] NumPy arrays, JAX arrays or lists; arrays that need no change are not copied.
+            Or a list of B single episodes, which are stacked.
         name: What they are called in the error message.
 
     Raises:
         ValueError: It is no `Episode`, or a field has another shape or kind than it should.
     """
+    if isinstance(episodes, list) and all(isinstance(one, Episode) for one in episodes):
+        episodes = stack_episodes(episodes)
     check_type(name, episodes, Episode)
+    assert isinstance(episodes, Episode)
     check_type(f"{name}.features", episodes.features, Features)
     odometry = _convert(f"{name}.odometry", episodes.odometry, ("B", "T", 3), jnp.floating)
     b, t = odometry.shape[:2]

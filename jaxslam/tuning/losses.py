@@ -89,6 +89,17 @@ BY_NAME: Mapping[str, Loss] = MappingProxyType(
 """The losses by name, as `jaxslam tune --loss` takes them."""
 
 
+def resolve(loss: Loss | str) -> Loss:
+    """A loss itself, or that of `BY_NAME` with a name.
+
+    Raises:
+        ValueError: There is none of this name.
+    """
+    if isinstance(loss, str) and loss not in BY_NAME:
+        raise ValueError(f"loss is {loss!r}; known names are {', '.join(BY_NAME)}")
+    return BY_NAME[loss] if isinstance(loss, str) else loss
+
+
 def name_of(loss: Loss) -> str:
     """Name of a loss of `BY_NAME`.
 

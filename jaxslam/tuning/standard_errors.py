@@ -61,9 +61,9 @@ class StandardErrors(NamedTuple):
 def standard_errors(
     config: Config,
     params: NoiseParams,
-    episodes: Episode,
+    episodes: Episode | list[Episode],
     *,
-    loss: Loss = pose_nll,
+    loss: Loss | str = pose_nll,
     frozen: Collection[str] = (),
 ) -> StandardErrors:
     """Standard errors of tuned parameters by the sandwich estimator, C = H^-1 J H^-1 / B.
@@ -75,7 +75,7 @@ def standard_errors(
     Args:
         config: Its filter is the one that was tuned.
         params: Minimum of the mean loss over the episodes, as `fitting.tune` found it.
-        episodes: [B] episodes that it was tuned on.
+        episodes: [B] episodes that it was tuned on, or a list of single ones.
         loss: The loss that it was tuned by.
         frozen: Names of parameters, or fields of the noise, that were not tuned.
 
@@ -85,12 +85,12 @@ def standard_errors(
     References:
         White (1982), "Maximum likelihood estimation of misspecified models".
     """
-    params, episodes = prepare(config, params, episodes, loss)
+    params, stacked, function = prepare(config, params, episodes, loss)
     params = as_params(params)
     trainable = parameters.trainable_mask(params, frozen)
-    if len(episodes.odometry) < 2:
+    if len(stacked.odometry) < 2:
         raise ValueError("standard errors need two episodes or more; episodes has 1")
-    hessian, gradients = second_derivatives(config, params, episodes, loss=loss, frozen=frozen)
+    hessian, gradients = second_derivatives(config, params, stacked, loss=function, frozen=frozen)
     used = len(gradients)
     outer = gradients.T @ gradients / max(used, 1)
     if used < 2:

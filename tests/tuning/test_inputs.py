@@ -11,7 +11,7 @@ from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import episode_from_arrays
 from jaxslam.pipeline.stacking import stack_episodes
 from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors
-from jaxslam.tuning.inputs import as_episodes
+from jaxslam.tuning.inputs import as_episodes, prepare
 
 B, T, M, L = 3, 4, 2, 5
 CONFIG = Config.for_landmark_sensor(L, M)
@@ -56,7 +56,7 @@ BAD_ARGUMENTS = [
     ((CONFIG.filter, PARAMS, EPISODES), "config is FilterConfig, not Config"),
     ((CONFIG, EPISODES, PARAMS), "params is Episode, not NoiseParams"),
     ((CONFIG, dict(PARAMS._asdict()), EPISODES), "params is dict, not NoiseParams"),
-    ((CONFIG, PARAMS, [EPISODES]), "episodes is list, not Episode"),
+    ((CONFIG, PARAMS, [EPISODES]), r"episodes.odometry is float64 \(1, 3, 4, 3\), not floating"),
     (
         (CONFIG, PARAMS._replace(odometry_coefficients=[0.1] * 3), EPISODES),
         r"params.odometry_coefficients is .*\(3,\), not floating \(4,\)",
@@ -87,7 +87,8 @@ BAD_ARGUMENTS = [
         (CONFIG, PARAMS, EPISODES._replace(landmark_ids=EPISODES.landmark_ids + L)),
         "episodes.landmark_ids holds 6, but config.filter.max_landmarks is 5",
     ),
-    ((CONFIG, PARAMS, EPISODES, "pose_mse"), "loss is 'pose_mse', not a function"),
+    ((CONFIG, PARAMS, EPISODES, 3.0), "loss is 3.0, not a function"),
+    ((CONFIG, PARAMS, EPISODES, "likelihood"), "loss is 'likelihood'; known names are pose_nll"),
     ((CONFIG, PARAMS, EPISODES, losses.WeightedLoss(())), "loss is a WeightedLoss without terms"),
     ((CONFIG, PARAMS, jax.tree.map(lambda x: x[:0], EPISODES)), "episodes: no episodes"),
     (
@@ -221,3 +222,10 @@ def test_whole_numbers_are_taken_as_noise(precision):
 
 def test_episodes_that_need_no_change_are_not_copied():
     assert as_episodes(EPISODES).odometry is EPISODES.odometry
+
+
+def test_a_list_of_single_episodes_and_the_name_of_a_loss_are_taken():
+    singles = [jax.tree.map(lambda x: np.asarray(x)[k], EPISODES) for k in range(B)]  # noqa: B023
+    _, stacked, function = prepare(CONFIG, PARAMS, singles, "innovation_nll")
+    assert function is losses.innovation_nll
+    jax.tree.map(np.testing.assert_array_equal, stacked, as_episodes(EPISODES))

@@ -338,8 +338,7 @@ def compute(seed: int, num_trials: int, repeats: int, office: int) -> Numbers:
     numbers = speed(seed, num_trials, repeats)
     of_step, episodes = latency(seed, office)
     with tempfile.TemporaryDirectory() as folder:
-        file = str(Path(folder) / "episodes.npz")
-        np.savez(file, *jax.tree.leaves(episodes))
+        np.savez(file := f"{folder}/episodes.npz", *jax.tree.leaves(episodes))
         numbers |= gradient_memory(folder, seed, num_trials)
         numbers |= two_devices(folder, seed, num_trials, repeats) | of_step
         arguments = {"seed": seed, "num_trials": num_trials, "num_filterpy": 4, "episodes": file}

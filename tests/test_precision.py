@@ -34,7 +34,7 @@ def scans_of_a_drive():
     world = worlds.World(jnp.asarray(worlds.named("office").walls, float))
     path = jnp.asarray(densify(worlds.waypoints("office")), float)
     key = jax.random.key(1)
-    return drives.simulate_scans(key, CONFIG, Robot(), world, path, num_scans=SCANS)
+    return drives.simulate_scans(key, CONFIG.frontend.lidar, Robot(), world, path, num_scans=SCANS)
 
 
 def test_features_are_the_same_in_both_precisions(precision):

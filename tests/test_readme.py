@@ -12,10 +12,17 @@ HOME = Path(__file__).resolve().parents[1]
 READMES = sorted(
     [HOME / "README.md", *HOME.glob("jaxslam/*/README.md"), *HOME.glob("experiments/*.md")]
 )
+SLOW = ["README.md", "jaxslam/simulation/README.md", "jaxslam/pipeline/README.md"]
 LONGEST = {"README.md": 250, "jaxslam/cli/README.md": 90, "experiments/README.md": 90}
 PROGRAM_LINES = 15
 BLOCKS = [
-    pytest.param(path, number, text, id=f"{path.relative_to(HOME)}:{number}")
+    pytest.param(
+        path,
+        number,
+        text,
+        id=f"{path.relative_to(HOME)}:{number}",
+        marks=[pytest.mark.slow] if str(path.relative_to(HOME)) in SLOW else [],
+    )
     for path in READMES
     for number, text in enumerate(re.findall(r"```python\n(.*?)```", path.read_text(), re.S))
 ]

@@ -120,6 +120,7 @@ def check_pictures(folder):
         assert (folder / name).read_bytes().startswith(b"\x89PNG"), name
 
 
+@pytest.mark.slow
 def test_simulate_writes_its_files_and_nothing_else(done):
     names = {"metrics.json", "trajectory.tum", "truth.tum", "map.geojson", *PICTURES}
     assert {file.name for file in done.simulated.iterdir()} == names
@@ -127,6 +128,7 @@ def test_simulate_writes_its_files_and_nothing_else(done):
     check_pictures(done.simulated)
 
 
+@pytest.mark.slow
 def test_simulate_measures_what_it_promises(done):
     numbers = load(done.simulated)
     assert numbers["runs"] == 2 and numbers["diverged"] == 0
@@ -140,6 +142,7 @@ def test_simulate_measures_what_it_promises(done):
     assert {"position_rmse_m", "heading_rmse_deg"} <= numbers["dead_reckoning"].keys()
 
 
+@pytest.mark.slow
 def test_simulate_prints_its_first_result_and_a_summary(done):
     assert "first 2 trials: position RMSE" in done.said + done.errors
     assert "2/2" in done.errors
@@ -147,10 +150,12 @@ def test_simulate_prints_its_first_result_and_a_summary(done):
     assert len(done.said.splitlines()) < 24
 
 
+@pytest.mark.slow
 def test_simulate_keeps_compiled_programs(done):
     assert any((done.place / "cache" / "jaxslam").iterdir())
 
 
+@pytest.mark.slow
 def test_evo_reads_the_trajectories(done):
     found, truth = (
         file_interface.read_tum_trajectory_file(done.simulated / name)
@@ -162,6 +167,7 @@ def test_evo_reads_the_trajectories(done):
     assert 0.0 < error.get_statistic(evo_metrics.StatisticsType.rmse) < 0.3
 
 
+@pytest.mark.slow
 def test_run_writes_its_files_and_nothing_else(done):
     names = {"metrics.json", "trajectory.tum", "map.geojson", "map.graphml", "map.yaml", "map.pgm"}
     names |= {"graph.g2o", "scan.png", "run.gif", *PICTURES}
@@ -174,6 +180,7 @@ def test_run_writes_its_files_and_nothing_else(done):
         assert animation.n_frames == SCANS
 
 
+@pytest.mark.slow
 def test_the_occupancy_map_of_a_run_agrees_with_the_world(done):
     """Cells that are occupied lie on walls, and most walls that were seen are in the map."""
     found = ros_map.read(done.recorded / "map.yaml")
@@ -189,6 +196,7 @@ def test_the_occupancy_map_of_a_run_agrees_with_the_world(done):
     assert len(points) > 200 and np.quantile(away, 0.95) < 0.15
 
 
+@pytest.mark.slow
 def test_networkx_reads_the_graph(done):
     graph = networkx.read_graphml(done.recorded / "map.graphml")
     assert len(graph) == sum(
@@ -197,6 +205,7 @@ def test_networkx_reads_the_graph(done):
     )
 
 
+@pytest.mark.slow
 def test_run_beats_its_odometry(done):
     numbers = load(done.recorded)
     blind = numbers["dead_reckoning"]
@@ -212,12 +221,14 @@ def test_run_beats_its_odometry(done):
     assert numbers["filter"]["ate_rmse_m"] != numbers["ate_rmse_m"]  # it was smoothed
 
 
+@pytest.mark.slow
 def test_run_starts_at_the_origin_on_the_clock_of_the_log(done):
     times, poses = tum.read(done.recorded / "trajectory.tum")
     np.testing.assert_allclose(times, np.arange(SCANS) + 0.5)
     np.testing.assert_allclose(poses[0], 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_run_says_how_many_lines_it_skipped(done):
     assert "1 broken lines" in done.said_of_log or "1 broken line" in done.said_of_log
 

@@ -1,4 +1,6 @@
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,14 +16,27 @@ OLD = " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_cou
 OLD = OLD if jax.__version_info__ < (0, 11) else ""
 os.environ.setdefault("XLA_FLAGS", FLAGS + OLD)
 
+# What one worker has compiled, the others find in a folder, whose name they inherit.
+OWNS_CACHE = "JAX_COMPILATION_CACHE_DIR" not in os.environ
+if OWNS_CACHE:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="compiled-")
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
-@pytest.fixture(params=["float64", "float32"])
+def pytest_unconfigure() -> None:
+    """Remove the compiled programs of this run."""
+    if OWNS_CACHE:
+        shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+
+
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def precision(request) -> Iterator[str]:
-    """Run a test twice: in float64, as all tests are, and in float32, as users are."""
+    """Run a test in float32, as users do, and slowly in float64, too, as all other tests do."""
     with jax.enable_x64(request.param == "float64"):
         yield request.param
 

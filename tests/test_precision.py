@@ -1,6 +1,7 @@
-"""The part of the tests that runs in both precisions: float64, as all tests, float32, as users.
+"""The chain from simulated scans to filtered poses, gradients, a smoothed log and its map.
 
-From simulated scans to filtered poses, gradients, standard errors, a smoothed log and its map.
+It runs in float32, as users do; all other tests run in float64, and with `pytest -m slow` so does
+this one.
 """
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxslam import Config, NoiseParams, evaluate, filter_episodes, run_slam, simulate_episodes
+from jaxslam.core.scan import Lidar
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.extract import extract_features
@@ -19,11 +21,12 @@ from jaxslam.simulation.path_following import densify
 from jaxslam.simulation.robot import Robot
 from jaxslam.tuning.fitting import gradients
 
-CONFIG = Config(
+CONFIG = Config.for_lidar(
+    Lidar(num_beams=181, angle_min=-np.pi / 2, angle_increment=np.pi / 180),
     frontend=FrontendConfig(grid=GridSpec(x_max=5.0, y_half=4.0)),
     filter=FilterConfig(max_landmarks=32),
 )
-SCANS = 24
+SCANS = 16
 
 
 def dtype(precision):
@@ -40,11 +43,12 @@ def scans_of_a_drive():
 def test_features_are_the_same_in_both_precisions(precision):
     world = worlds.World(jnp.asarray(worlds.named("office").walls, float))
     scan = ray_casting.cast(CONFIG.frontend.lidar, world, jnp.array([10.35, 5.0, 1.5]))
-    found = jax.jit(extract_features, static_argnums=0)(CONFIG.frontend, scan)
+    extract = jax.jit(extract_features, static_argnums=0)
+    found = extract(CONFIG.frontend, scan)
     assert found.xy.dtype == dtype(precision)
     with jax.enable_x64(True):
-        exact = extract_features(CONFIG.frontend, to_scan(CONFIG.frontend.lidar, np.asarray(
-            scan.ranges, np.float64)))  # fmt: skip
+        ranges = np.asarray(scan.ranges, np.float64)
+        exact = extract(CONFIG.frontend, to_scan(CONFIG.frontend.lidar, ranges))
     assert np.array_equal(found.kind, exact.kind) and np.array_equal(found.valid, exact.valid)
     np.testing.assert_allclose(found.xy, exact.xy, atol=1e-4)
 

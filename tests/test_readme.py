@@ -12,7 +12,10 @@ HOME = Path(__file__).resolve().parents[1]
 READMES = sorted(
     [HOME / "README.md", *HOME.glob("jaxslam/*/README.md"), *HOME.glob("experiments/*.md")]
 )
-SLOW = ["README.md", "jaxslam/simulation/README.md", "jaxslam/pipeline/README.md"]
+SLOW = [
+    "README.md",
+    *(f"jaxslam/{name}/README.md" for name in ("simulation", "pipeline", "tuning")),
+]
 LONGEST = {"README.md": 250, "jaxslam/cli/README.md": 90, "experiments/README.md": 90}
 PROGRAM_LINES = 15
 BLOCKS = [

@@ -19,6 +19,7 @@ A pose (3,) is x [m], y [m], heading [rad] of the robot frame in odom, map or wo
 Grids: cell [i, j] covers a square of the robot frame; i grows with x, j with y.
 """
 
+import operator
 from typing import Any
 
 import jax
@@ -36,6 +37,19 @@ Key = jax.Array
 
 JUNCTION, CORNER, WALL = 0, 1, 2
 """Kinds of landmarks: junction of the Voronoi diagram, corner of two walls, wall direction."""
+
+
+def check_type(name: str, x: Any, wanted: type, *, advice: str = "") -> None:
+    """Raise ValueError unless an argument is a record of this type.
+
+    Args:
+        name: Name of `x`, for the message.
+        x: The record.
+        wanted: Its type.
+        advice: Ends the message.
+    """
+    if not isinstance(x, wanted):
+        raise ValueError(f"{name} is {type(x).__name__}, not {wanted.__name__}{advice}")
 
 
 def check_array(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> None:
@@ -88,6 +102,24 @@ def as_float64(name: str, x: Any, shape: tuple[Any, ...]) -> np.ndarray:
     x = np.asarray(_as_numbers(name, x), np.float64)
     check_array(name, x, shape)
     return x
+
+
+def as_count(name: str, x: Any, *, least: int = 1) -> int:
+    """A whole number of Python, of one of Python or NumPy; raise ValueError if it is below `least`.
+
+    Args:
+        name: Name of `x`, for the message.
+        x: The number; bools, and floats without a fraction, are refused.
+        least: The least that is accepted.
+    """
+    wanted = f"{name} is {x!r}, not a whole number of at least {least}"
+    try:
+        number = operator.index(x)
+    except TypeError:
+        raise ValueError(wanted) from None
+    if isinstance(x, bool) or number < least:
+        raise ValueError(wanted)
+    return number
 
 
 def as_bool(name: str, x: Any, shape: tuple[Any, ...]) -> Array:

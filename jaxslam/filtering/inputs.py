@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement, ScanMatch
-from jaxslam.core.types import Array, as_float, check_array
+from jaxslam.core.types import Array, as_float, check_array, check_type
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 
@@ -54,12 +54,12 @@ def check_inputs(
             `params.scan_match_std_scale` is None; the message states which. The reverse is no
             error: loop closures use that parameter, too.
     """
-    _check_record("belief", belief, Belief)
+    check_type("belief", belief, Belief)
     check_array("belief.mean", belief.mean, ("D",), jnp.floating)
     dtype = belief.mean.dtype
     params = check_params(params, dtype)
     name = "measurements" if over_time else "measurement"
-    _check_record(name, measurement, Measurement)
+    check_type(name, measurement, Measurement)
     scan_match = measurement.scan_match
     if scan_match is not None and params.scan_match_std_scale is None:
         raise ValueError(f"params.scan_match_std_scale is None, but {name}.scan_match is given")
@@ -74,18 +74,21 @@ def check_inputs(
     return params, Measurement(odometry, features, ids, scan_match)
 
 
-def check_params(params: NoiseParams, dtype: Any = float) -> NoiseParams:
+def check_params(
+    params: NoiseParams, dtype: Any = float, *, check_values: bool = True
+) -> NoiseParams:
     """Check noise parameters, and convert them to JAX arrays.
 
     Args:
         params: Noise parameters.
         dtype: Type of the floats; by default JAX's.
+        check_values: Whether values are checked, where they are concrete.
 
     Raises:
         ValueError: A shape is wrong, or a value is concrete and not positive and finite; those of
             `odometry_coefficients` may be 0.
     """
-    _check_record("params", params, NoiseParams)
+    check_type("params", params, NoiseParams)
 
     def convert(field: str, value: Any) -> Array | None:
         if value is None and field == "scan_match_std_scale":
@@ -93,7 +96,7 @@ def check_params(params: NoiseParams, dtype: Any = float) -> NoiseParams:
         name = f"params.{field}"
         array = _floats(name, value, (4,) if field == "odometry_coefficients" else (), dtype)
         numbers = concrete_values(array)
-        if numbers is not None:
+        if check_values and numbers is not None:
             in_range = numbers >= 0.0 if field in MAY_BE_ZERO else numbers > 0.0
             if not np.all(in_range & np.isfinite(numbers)):
                 wanted = "non-negative" if field in MAY_BE_ZERO else "positive"
@@ -110,12 +113,6 @@ def concrete_values(x: Array) -> np.ndarray | None:
     return np.asarray(x)
 
 
-def _check_record(name: str, record: Any, kind: type) -> None:
-    """Raise ValueError unless a record is of this kind."""
-    if not isinstance(record, kind):
-        raise ValueError(f"{name} is {type(record).__name__}, not {kind.__name__}")
-
-
 def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any) -> Features:
     """Features that lead with `lead` and M, checked and converted.
 
@@ -128,7 +125,7 @@ def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any
     Raises:
         ValueError: A shape or type is wrong, or there is no feature at all (M = 0).
     """
-    _check_record(name, features, Features)
+    check_type(name, features, Features)
     kind = _as_type(f"{name}.kind", features.kind, (*lead, "M"), jnp.integer, jnp.int32)
     if not kind.shape[-1]:
         raise ValueError(f"{name} holds no feature, M = 0; give one with valid = False")
@@ -143,7 +140,7 @@ def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any
 
 def as_scan_match(name: str, scan_match: ScanMatch, lead: tuple[int, ...], dtype: Any) -> ScanMatch:
     """Results of scan matching that lead with `lead`, checked and converted as `as_features`."""
-    _check_record(name, scan_match, ScanMatch)
+    check_type(name, scan_match, ScanMatch)
     increment, information, inlier_fraction = scan_match
     return ScanMatch(
         _floats(f"{name}.increment", increment, (*lead, 3), dtype),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import as_float64, check_array
+from jaxslam.core.types import as_float64, check_array, check_type
 from jaxslam.filtering.inputs import check_params
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.lidar import to_scan
@@ -111,12 +111,6 @@ def as_scans(lidar: Lidar, ranges: Any, num_scans: int) -> Scan:
             "config.frontend.lidar.range_max; are they in metres?"
         )
     return scans
-
-
-def check_type(name: str, x: Any, wanted: type) -> None:
-    """Raise ValueError unless an argument is a record of this type."""
-    if not isinstance(x, wanted):
-        raise ValueError(f"{name} is {type(x).__name__}, not {wanted.__name__}")
 
 
 def as_params(params: Any, *, match_scans: bool) -> NoiseParams:

@@ -18,7 +18,7 @@ from jaxslam.core.logs import LandmarkLog, LaserLog
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2 import dead_reckoning
 from jaxslam.core.time_series import match_times
-from jaxslam.core.types import Array, as_float64, check_array
+from jaxslam.core.types import Array, as_float64, check_array, check_type
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import FilterConfig, check_config, confirmed, init
 from jaxslam.filtering.noise import NoiseParams
@@ -106,7 +106,7 @@ def filter_episodes(
             lead with B and T; or they hold scan matches that the parameters have no noise for, or
             landmarks that the map has no slots for.
     """
-    arguments.check_type("config", config, Config)
+    check_type("config", config, Config)
     check_config(config.filter)  # the scanner does not matter here
     stacked = as_episodes(episodes)
     check_array("episodes.odometry", stacked.odometry, ("B", "T", 3), jnp.floating)

@@ -52,6 +52,13 @@ def stack_episodes(episodes: Sequence[Episode]) -> Episode:
     return jax.tree.map(lambda *x: np.stack(x), *map(padded, episodes))
 
 
+def stack_list(episodes: Any) -> Any:
+    """A list of episodes stacked to one record; what is no such list as it is."""
+    if isinstance(episodes, list) and all(isinstance(one, Episode) for one in episodes):
+        return stack_episodes(episodes)
+    return episodes
+
+
 def numpy_episode(
     truth: AnyArray,
     odometry: AnyArray,
@@ -87,8 +94,7 @@ def as_episodes(episodes: Any) -> Episode:
     Raises:
         ValueError: It is something else.
     """
-    if isinstance(episodes, list) and all(isinstance(one, Episode) for one in episodes):
-        episodes = stack_episodes(episodes)
+    episodes = stack_list(episodes)
     if not isinstance(episodes, Episode):
         raise ValueError(f"episodes is {type(episodes).__name__}, not Episode or a list of them")
     kinds = {"f": jnp.zeros(()).dtype, "i": np.dtype(np.int32)}

@@ -3,7 +3,6 @@
 An argument that is refused raises ValueError, which names it, what was given, and what is expected.
 """
 
-import operator
 from typing import Any
 
 import jax
@@ -26,17 +25,6 @@ def check_key(key: Any) -> None:
     if not is_key or key.shape:
         given = f"{key.dtype} {key.shape}" if isinstance(key, jax.Array) else repr(key)
         raise ValueError(f"key is {given}, not one key as jax.random.key(seed) makes it")
-
-
-def as_count(name: str, x: Any, *, least: int = 1) -> int:
-    """A whole number of at least `least`; ValueError otherwise."""
-    try:
-        number = operator.index(x)
-    except TypeError:
-        raise ValueError(f"{name} is {x!r}, not a whole number") from None
-    if number < least:
-        raise ValueError(f"{name} is {number}; it must be {least} or more")
-    return number
 
 
 def as_robot(robot: Any) -> Robot:

@@ -12,7 +12,7 @@ from jax import lax
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import Array, Key
+from jaxslam.core.types import Array, Key, as_count
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
@@ -59,7 +59,7 @@ def _drive_of(
     points = arguments.as_path(path, world)
     if num_scans is None:
         return _Drive(robot, walls, points, num_scans_of_drive(robot, points))
-    return _Drive(robot, walls, points, arguments.as_count("num_scans", num_scans))
+    return _Drive(robot, walls, points, as_count("num_scans", num_scans))
 
 
 def replay_trial(
@@ -93,7 +93,7 @@ def replay_trial(
     """
     params = as_params(params, match_scans=False)
     given = _drive_of(key, config, robot, world, path, num_scans)
-    number = arguments.as_count("trial", trial, least=0)
+    number = as_count("trial", trial, least=0)
     trial_key = trial_keys(key, jnp.array([number]))[0]
 
     def scans_of(own: Key) -> tuple[Array, Array, Scan]:
@@ -158,7 +158,7 @@ def simulate_episodes(
         ValueError: An argument is not possible; the message says what is expected.
     """
     given = _drive_of(key, config, robot, world, path, num_scans)
-    keys = trial_keys(key, jnp.arange(arguments.as_count("num_trials", num_trials)))
+    keys = trial_keys(key, jnp.arange(as_count("num_trials", num_trials)))
     robot, walls, points, steps = given
     return simulate_keys(keys, config, robot, walls, points, num_scans=steps)
 
@@ -240,8 +240,8 @@ def run_trials(
     """
     params = as_params(params, match_scans=False)
     given = _drive_of(key, config, robot, world, path, num_scans)
-    total = arguments.as_count("num_trials", num_trials)
-    begin = arguments.as_count("first", first, least=0)
+    total = as_count("num_trials", num_trials)
+    begin = as_count("first", first, least=0)
     if devices is not None and not len(devices):
         raise ValueError("devices is empty; None stands for all")
     used = jax.devices() if devices is None else devices

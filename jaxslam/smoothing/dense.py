@@ -16,10 +16,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
-from jaxslam.core.types import AnyArray, Array
+from jaxslam.core.types import AnyArray, Array, as_count
 from jaxslam.smoothing import arrowhead
 from jaxslam.smoothing.arrowhead import State
 from jaxslam.smoothing.problem import SmoothingProblem, SmoothingResult, as_problem
@@ -64,8 +63,7 @@ def smooth_trial(
         ValueError: An argument has another shape or kind, or `iterations` is no whole number from
             0.
     """
-    if not isinstance(iterations, int | np.integer) or iterations < 0:
-        raise ValueError(f"iterations is {iterations}, not a whole number of 0 or more")
+    iterations = as_count("iterations", iterations, least=0)
     problem, poses, landmark_positions = as_problem(problem, poses, landmark_positions)
     return _smooth_trial(problem, poses, landmark_positions, iterations=int(iterations))
 

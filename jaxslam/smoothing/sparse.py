@@ -33,7 +33,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from jaxslam.core import trace_cache
-from jaxslam.core.types import AnyArray, Array
+from jaxslam.core.types import AnyArray, Array, as_count
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.smoothing import arrowhead
 from jaxslam.smoothing.arrowhead import Jacobian
@@ -104,8 +104,7 @@ def smooth_log(
     """
     if not robust_scale > 0.0:
         raise ValueError(f"robust_scale is {robust_scale}, not a positive number of std")
-    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
-        raise ValueError(f"max_iterations is {max_iterations}, not a whole number of 0 or more")
+    max_iterations = as_count("max_iterations", max_iterations, least=0)
     scale = np.float64(min(robust_scale, 1e9))  # finite; so large that the kernel is a square
     with jax.enable_x64(True):
         given = as_problem(problem, poses, landmark_positions)

@@ -19,12 +19,12 @@ from jax.flatten_util import ravel_pytree
 
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode, measurements_of
-from jaxslam.core.types import Array
+from jaxslam.core.types import Array, as_count
 from jaxslam.filtering import config as config_module
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
-from jaxslam.tuning.inputs import as_params, check_alike, check_count, prepare
+from jaxslam.tuning.inputs import as_params, check_alike, prepare
 from jaxslam.tuning.losses import Loss, pose_nll
 from jaxslam.tuning.optimizers import default_optimizer
 from jaxslam.tuning.parameters import constrain, trainable_mask, unconstrain, unflatten_params
@@ -173,11 +173,12 @@ def tune(
     if heldout is not None:
         validation = prepare(config, params, heldout, loss, name="heldout")[1]
         check_alike(training, validation)
-    num_updates, seed = check_count("num_updates", num_updates, 0), check_count("seed", seed, 0)
-    check_count("evaluate_every", evaluate_every, 1)
-    check_count("patience", 1 if patience is None else patience, 1)
+    num_updates = as_count("num_updates", num_updates, least=0)
+    seed = as_count("seed", seed, least=0)
+    as_count("evaluate_every", evaluate_every)
+    as_count("patience", 1 if patience is None else patience)
     trainable, count = trainable_mask(params, frozen), training.odometry.shape[0]
-    size = count if batch_size is None else min(count, check_count("batch_size", batch_size, 1))
+    size = count if batch_size is None else min(count, as_count("batch_size", batch_size))
     whole = size == count
     if optimizer is None:
         optimizer = default_optimizer(num_updates, whole=whole)

@@ -1,6 +1,5 @@
 """Checks of what this package is given: configuration, noise, episodes. Nothing is compiled yet."""
 
-import operator
 from typing import Any
 
 import jax
@@ -10,11 +9,11 @@ import numpy as np
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import ScanMatch
-from jaxslam.core.types import as_float, check_array
-from jaxslam.filtering.inputs import FLOATS, OTHERS
+from jaxslam.core.types import check_array, check_type
+from jaxslam.filtering.inputs import FLOATS, OTHERS, check_params, concrete_values
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.stacking import stack_episodes
+from jaxslam.pipeline.stacking import stack_list
 from jaxslam.tuning.losses import Loss, check_loss, resolve
 
 SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
@@ -23,6 +22,8 @@ SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
     "inlier_fraction": (),
 }
 """Sizes after B and T of each field of `ScanMatch`, in its order; all are floats."""
+
+ORDER = "; the order is config, params, episodes"  # two that were swapped are the usual cause
 
 
 def prepare(
@@ -38,7 +39,7 @@ def prepare(
     The values of the noise are not looked at: an optimiser may propose some that overflow, whose
     loss is not finite.
     """
-    check_type("config", config, Config)
+    check_type("config", config, Config, advice=ORDER)
     params, stacked = as_params(params, positive=False), as_episodes(episodes, name=name)
     function = resolve(loss)
     check_loss(function, stacked, name=name)
@@ -52,14 +53,6 @@ def prepare(
     return params, stacked, function
 
 
-def check_type(name: str, x: Any, wanted: type) -> None:
-    """Raise ValueError unless an argument is a record of this type."""
-    if not isinstance(x, wanted):
-        swapped = wanted in (Config, NoiseParams, Episode)  # the usual cause
-        order = "; the order is config, params, episodes" if swapped else ""
-        raise ValueError(f"{name} is {type(x).__name__}, not {wanted.__name__}{order}")
-
-
 def as_params(params: NoiseParams, *, positive: bool = True) -> NoiseParams:
     """Noise parameters as JAX arrays of the default float type, checked.
 
@@ -71,18 +64,15 @@ def as_params(params: NoiseParams, *, positive: bool = True) -> NoiseParams:
         ValueError: It is no `NoiseParams`, or a field has not its shape or is not finite and
             positive.
     """
-    check_type("params", params, NoiseParams)
-    arrays = {}
-    for field, x in params._asdict().items():
-        if x is None and field == "scan_match_std_scale":
-            continue
-        shape = (4,) if field == "odometry_coefficients" else ()
-        arrays[field] = jnp.asarray(as_float(f"params.{field}", x, shape), float)
-        if positive and not isinstance(x, jax.core.Tracer):
-            numbers = np.asarray(x, np.float64)
-            if not (np.isfinite(numbers) & (numbers > 0.0)).all():
-                raise ValueError(f"params.{field} is {numbers.tolist()}, not positive and finite")
-    return params._replace(scan_match_std_scale=None)._replace(**arrays)
+    check_type("params", params, NoiseParams, advice=ORDER)
+    params = check_params(params, check_values=positive)
+    coefficients = concrete_values(params.odometry_coefficients)
+    if positive and coefficients is not None and not (coefficients > 0.0).all():
+        raise ValueError(
+            f"params.odometry_coefficients is {coefficients.tolist()}, not positive: it is tuned "
+            "by its logarithm"
+        )
+    return params
 
 
 def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") -> Episode:
@@ -96,9 +86,8 @@ def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") ->
     Raises:
         ValueError: It is no `Episode`, or a field has another shape or kind than it should.
     """
-    if isinstance(episodes, list) and all(isinstance(one, Episode) for one in episodes):
-        episodes = stack_episodes(episodes)
-    check_type(name, episodes, Episode)
+    episodes = stack_list(episodes)
+    check_type(name, episodes, Episode, advice=ORDER)
     assert isinstance(episodes, Episode)
     check_type(f"{name}.features", episodes.features, Features)
     odometry = _convert(f"{name}.odometry", episodes.odometry, ("B", "T", 3), jnp.floating)
@@ -186,14 +175,3 @@ def check_alike(episodes: Episode, heldout: Episode) -> None:
             f"heldout has M = {other_m} features a step, episodes has {m}; pad them alike, as "
             "stack_episodes does"
         )
-
-
-def check_count(name: str, x: Any, least: int) -> int:
-    """An integer of at least `least`; ValueError otherwise."""
-    try:
-        number = operator.index(x)
-    except TypeError:
-        raise ValueError(f"{name} is {x!r}, not an integer") from None
-    if number < least:
-        raise ValueError(f"{name} is {number}; it must be {least} or more")
-    return number

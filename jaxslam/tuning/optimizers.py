@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxslam.core.types import Array
-from jaxslam.tuning.inputs import check_count
+from jaxslam.core.types import Array, as_count
 
 LBFGS_MEMORY = 10  # pairs of steps and gradient differences that L-BFGS stores
 MAX_CHANGE = 0.4  # largest change of a parameter in one step
@@ -55,7 +54,7 @@ def default_optimizer(num_updates: int, *, whole: bool) -> optax.GradientTransfo
     Raises:
         ValueError: `num_updates` is no integer of 0 or more, or `whole` is neither True nor False.
     """
-    num_updates = check_count("num_updates", num_updates, 0)
+    num_updates = as_count("num_updates", num_updates, least=0)
     if whole not in (True, False):
         raise ValueError(f"whole is {whole!r}, not True or False")
     return lbfgs_backtracking() if whole else _adam(num_updates)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from jaxslam.core.types import check_type
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.tuning.inputs import check_type
 
 
 def unconstrain(params: NoiseParams) -> NoiseParams:

@@ -9,8 +9,9 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
+from jaxslam.core.types import check_type
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.tuning.inputs import as_params, check_type
+from jaxslam.tuning.inputs import as_params
 from jaxslam.tuning.parameters import constrain, trainable_mask
 
 

@@ -33,6 +33,7 @@ def test_the_folder_for_the_results_must_be_named(monkeypatch, capsys):
     assert "--out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_both_labels_keep_what_the_paper_says_of_corridors():
     """Figure 6: lines in the middle, the bend, the shift, and no false branch."""
     claims = fig06_local.compute()["claims"]
@@ -42,6 +43,7 @@ def test_both_labels_keep_what_the_paper_says_of_corridors():
         assert all(x for x in of_mode.values() if isinstance(x, bool)), (mode, of_mode)
 
 
+@pytest.mark.slow
 def test_ten_scans_of_a_room_give_the_voronoi_graph_of_its_walls():
     """Figures 8 and 9, with a draw of the noise that the picture is not of."""
     walls = np.asarray(worlds.named(fig09_global.WORLD).walls)

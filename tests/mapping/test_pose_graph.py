@@ -3,11 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from small import CONFIG, LIDAR
 
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.scan import Lidar
 from jaxslam.core.se2_np import relative
-from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import g2o_writer
 from jaxslam.io.errors import InputError
@@ -17,7 +16,6 @@ from jaxslam.pipeline import offline
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import ray_casting, worlds
 
-LIDAR = Lidar(num_beams=91, angle_increment=np.pi / 90, range_max=8.0)
 ROOM = worlds.named("fig07")
 
 
@@ -30,7 +28,6 @@ def scans_of(pose):
 @pytest.fixture(scope="module")
 def drive():
     """A filtered drive around the room: result, arguments of `build_pose_graph`, true poses."""
-    config = Config.for_lidar(LIDAR, filter=FilterConfig(max_landmarks=24))
     turn = np.linspace(0.0, 2.0, 12)
     true = np.stack([2.5 + np.cos(turn), 2.0 + np.sin(turn), turn + np.pi / 2], axis=1)
     rng = np.random.default_rng(0)
@@ -43,9 +40,9 @@ def drive():
         jax.random.split(jax.random.key(0), 12), LIDAR, scans_of(true)
     )
     plain = {"match_scans": False, "smooth": False}
-    result = offline.run_slam(config, params, odometry, scans, start=true[0], **plain)
+    result = offline.run_slam(CONFIG, params, odometry, scans, start=true[0], **plain)
     given = {
-        "config": config.filter,
+        "config": CONFIG.filter,
         "params": params,
         "poses": result.poses,
         "belief": result.belief,

@@ -131,10 +131,10 @@ def test_noise_that_is_not_positive_is_refused(no_work, changes, message):
         ({"frozen": ("range",)}, "no parameter is called 'range'; known: odometry_coefficients"),
         ({"frozen": "range_std"}, "frozen is the string 'range_std'"),
         ({"frozen": PARAMS._fields}, "all parameters are frozen"),
-        ({"num_updates": -1}, "num_updates is -1; it must be 0 or more"),
-        ({"num_updates": 1.5}, "num_updates is 1.5, not an integer"),
-        ({"batch_size": 0}, "batch_size is 0; it must be 1 or more"),
-        ({"seed": -1}, "seed is -1; it must be 0 or more"),
+        ({"num_updates": -1}, "num_updates is -1, not a whole number of at least 0"),
+        ({"num_updates": 1.5}, "num_updates is 1.5, not a whole number"),
+        ({"batch_size": 0}, "batch_size is 0, not a whole number of at least 1"),
+        ({"seed": -1}, "seed is -1, not a whole number of at least 0"),
         ({"patience": 0}, "patience is 0"),
         ({"evaluate_every": 0}, "evaluate_every is 0"),
         ({"state": 3}, "state is int, not TuneState"),
@@ -169,7 +169,10 @@ def test_standard_errors_refuse_unknown_names_and_a_single_episode(no_work):
 
 
 def test_the_default_optimiser_and_the_names_refuse_what_they_do_not_know():
-    for bad, message in ((-1, "num_updates is -1"), ("30", "num_updates is '30', not an integer")):
+    for bad, message in (
+        (-1, "num_updates is -1"),
+        ("30", "num_updates is '30', not a whole number"),
+    ):
         with pytest.raises(ValueError, match=message):
             optimizers.default_optimizer(bad, whole=False)
     with pytest.raises(ValueError, match="whole is None, not True or False"):

@@ -3,18 +3,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from small import CONFIG, LIDAR
 
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.scan import Lidar
-from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.extract import extract_features
-from jaxslam.pipeline.config import Config
 from jaxslam.simulation import ray_casting, worlds
 from jaxslam.viz import animation, canvas
-
-LIDAR = Lidar(num_beams=61, angle_min=-np.pi / 2, angle_increment=np.pi / 60)
-CONFIG = Config.for_lidar(LIDAR, filter=FilterConfig(max_landmarks=24, confirm_count=2))
 
 
 def frames(path):

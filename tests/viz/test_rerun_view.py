@@ -6,21 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import CONFIG, LIDAR
 
-from jaxslam.core.scan import Lidar
 from jaxslam.filtering import config
-from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import offline
-from jaxslam.pipeline.config import Config
 from jaxslam.simulation import ray_casting, worlds
 from jaxslam.viz import rerun_view
 from jaxslam.viz.rerun_view import RerunView
-
-LIDAR = Lidar(num_beams=61, angle_min=-np.pi / 2, angle_increment=np.pi / 60)
-CONFIG = Config.for_lidar(LIDAR, filter=FilterConfig(max_landmarks=24, confirm_count=2))
 
 
 @pytest.fixture(scope="module")

@@ -1,3 +1,4 @@
+import gc
 import os
 import shutil
 import tempfile
@@ -15,6 +16,8 @@ FLAGS += " --xla_force_host_platform_device_count=2"
 OLD = " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 OLD = OLD if jax.__version_info__ < (0, 11) else ""
 os.environ.setdefault("XLA_FLAGS", FLAGS + OLD)
+
+gc.set_threshold(100_000)  # else collecting is a good part of tracing
 
 # What one worker has compiled, the others find in a folder, whose name they inherit.
 OWNS_CACHE = "JAX_COMPILATION_CACHE_DIR" not in os.environ

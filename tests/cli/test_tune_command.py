@@ -161,11 +161,13 @@ def test_progress_and_a_summary_are_printed(done):
     assert said[-1].startswith(f"results: {done.out}") and len(said) < 24
 
 
+@pytest.mark.slow
 def test_no_evaluation_is_lost_when_the_process_is_killed(stopped):
     assert 0 < stopped.history[0] and stopped.history[-1] < UPDATES
     assert (np.diff(stopped.history) > 0).all()
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_the_best_so_far_and_says_how_to_resume(stopped):
     said, errors = stopped.interrupted
     assert f"resuming after evaluation {stopped.history[-1]} of {UPDATES + 1}" in said
@@ -208,6 +210,7 @@ def test_another_tuning_does_not_resume_in_the_same_folder(
     assert "--out" in line
 
 
+@pytest.mark.slow
 def test_a_resumed_tuning_ends_as_an_uninterrupted_one(stopped, done):
     """The last test of a stopped tuning: it resumes to the end."""
     said, _ = end(begin(done.place, stopped.out))

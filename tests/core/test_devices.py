@@ -74,6 +74,7 @@ def output_of(code, **own):
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.slow
 def test_every_core_is_a_device_by_default():
     whole = "--xla_disable_hlo_passes=cpu-parallel-task-assigner"
     three = "--xla_force_host_platform_device_count=3"

@@ -87,6 +87,7 @@ def test_the_filter_equals_filterpy_and_its_gradient_equals_differences():
         np.testing.assert_allclose(slope[k], (high - low) / 2e-5, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_devices_filter_as_one_does_and_do_not_hang(tmp_path, monkeypatch):
     monkeypatch.setattr(filter_benchmark, "TIMEOUT", 120.0)
     ends = []
@@ -121,6 +122,7 @@ def test_peers_that_are_missing_or_broken_have_a_note(monkeypatch):
     assert found["filterpy"]["filter"]["batch"] == 2
 
 
+@pytest.mark.slow
 def test_neither_filter_nor_gradient_calls_lapack():
     config = Config(filter=FilterConfig(max_landmarks=8))
     params, beams = NoiseParams.for_simulated_robot(), (config.frontend.lidar.num_beams,)

@@ -88,6 +88,7 @@ def left_over(pid):
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.slow
 def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
     flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
@@ -134,6 +135,7 @@ def test_a_process_that_ends_early_ends_all(who, how, kind, line, tmp_path, monk
 
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.slow
 def test_a_process_that_is_missing_is_reported_in_one_line(number, tmp_path):
     """The command itself: the other one of two machines is never started."""
     port = processes.local(2).address.split(":")[1]
@@ -151,6 +153,7 @@ def test_a_process_that_is_missing_is_reported_in_one_line(number, tmp_path):
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.slow
 def test_no_process_outlives_the_one_that_started_it(tmp_path):
     code = "from experiments import processes; from tests.experiments import test_monte_carlo; "
     code += "processes.run_group(processes.local(2), test_monte_carlo.idle)"

@@ -105,6 +105,7 @@ def test_a_landmark_that_occurs_twice_in_a_scan_is_used_once():
     np.testing.assert_array_equal(once[0].num_seen, twice[0].num_seen)
 
 
+@pytest.mark.slow
 def test_features_without_a_known_landmark_are_invisible_in_values_and_gradients():
     _, odometry, polar, ids = drive(1)
     extra_polar = np.tile([[[2.0, 0.3], [3.0, 0.1]]], (T, 1, 1))
@@ -143,6 +144,7 @@ def test_wrong_shapes_are_refused_by_name():
         features.features_from_range_bearing(jnp.zeros((5, 2)), jnp.zeros(4, bool))
 
 
+@pytest.mark.slow
 def test_the_covariance_stays_positive_definite_over_50_000_steps_in_float32():
     steps, count, most = 50_000, 16, 4
     rng = np.random.default_rng(0)

@@ -353,6 +353,7 @@ def test_duplicates_are_merged_into_the_older_landmark():
     assert np.trace(belief.map_cov[:2, :2]) < before
 
 
+@pytest.mark.slow
 def test_gradients_stay_finite_with_a_full_map_and_a_diverged_neighbour(drives):
     config = SMALL._replace(max_landmarks=3, evict_after=0, confirm_count=2)
     log_params, unravel = ravel_pytree(jax.tree.map(jnp.log, NOISE))

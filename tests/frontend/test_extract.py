@@ -45,6 +45,7 @@ def assert_all_equal(results):
         jax.tree.map(np.testing.assert_array_equal, other, first)
 
 
+@pytest.mark.slow
 def test_results_for_lists_and_arrays_are_the_same():
     """Scans are constants of the program: an argument of it would be a JAX array already."""
 

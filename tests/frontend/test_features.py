@@ -126,6 +126,7 @@ def test_float32_finds_what_float64_finds():
         np.testing.assert_allclose(getattr(single, name), getattr(double, name), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_junction_by_the_ranges_equals_finite_differences():
     scan = ray_casting.add_range_noise(jax.random.key(0), LIDAR, scan_of(TRIANGLE, IN_TRIANGLE))
 

@@ -227,6 +227,7 @@ def pair():
     return both, episodes.stack_episodes(both)
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing_of_a_drive(pair):
     (short, long), both = pair
     assert both.odometry.shape == (2, 9, 3) and both.landmark_ids.shape == (2, 9, 5)
@@ -253,6 +254,7 @@ def test_padding_changes_nothing_where_all_poses_are_known(pair):
     np.testing.assert_allclose(filtered(take(both, 0))[1], value, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing_of_scans(scan_log):
     """A filter does not depend on later scans: alone, the log has the info of a longer one."""
     log, steps = scan_log[0], SCANS - FIRST

@@ -233,6 +233,7 @@ def compiled(caplog, run):
     return re.findall(r"Compiling jit\((\w+)\)", caplog.text)
 
 
+@pytest.mark.slow
 def test_a_log_of_another_length_needs_no_other_program(drive, results, caplog):
     odometry, scans = jax.tree.map(lambda x: x[:6], drive)
     names = compiled(caplog, lambda: online_slam((odometry, scans)))

@@ -257,6 +257,7 @@ def test_a_path_that_is_too_short_is_refused_by_all_that_drive_along_it():
         drive(KEY, ROBOT, jnp.asarray(PATH[:5]), num_scans=3)
 
 
+@pytest.mark.slow
 def test_a_trial_is_replayed_with_its_own_noise(nine):
     truth, result = trials.replay_trial(KEY, *SETTING, trial=5, num_scans=STEPS)
     whole = episodes.concatenate_results(nine)

@@ -262,6 +262,7 @@ def test_wrong_arguments_are_refused_by_name():
         smooth_trial(problem, poses, positions, iterations=-1)
 
 
+@pytest.mark.slow
 def test_on_drives_past_known_landmarks_its_error_is_less_than_the_filters():
     errors = smoothing.compute(0, 16)
     ratio = errors["filter"]["position_rmse_m"] / errors["smoother"]["position_rmse_m"]

@@ -69,6 +69,7 @@ def test_gradients_agree_with_finite_differences(episodes):
         np.testing.assert_allclose(ours[:, i], slope, rtol=2e-5, atol=2e-7, err_msg=str(i))
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_stationary_at_the_true_parameters():
     """The score has mean zero at the truth; 4.5 standard errors."""
     many = exact_model.drives(jax.random.key(4), TRUTH, num_trials=64, num_scans=30)

@@ -42,6 +42,7 @@ def drive():
     return Measurement(odometry, extract(scans)), scans, poses
 
 
+@pytest.mark.slow
 def test_a_run_is_drawn_a_few_scans_a_frame(drive, tmp_path):
     measurements, scans, poses = drive
     params = NoiseParams.for_laser_log()

@@ -1,0 +1,210 @@
+"""The time of scans and odometry: which stamps can be used, and how the two streams are joined.
+
+Stamps that are fine stay as they are. Where they do not distinguish the scans, or were set back,
+the time of reception takes their place, or the order in the file.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.core.se2_np import relative
+from jaxslam.core.time_series import sort_by_time
+from jaxslam.io.raw_log import RawOdometry, Stamps
+
+MIN_DISTINCT = 0.9  # least fraction of the scans' stamps that must differ from all others
+MIN_DISTINCT_ODOMETRY = 0.5  # likewise of the odometry, which some robots send twice
+MIN_SPREAD = 0.1  # least fraction of stamps that differ, so that equal ones are spread in between
+MAX_SCANS_BACK = 10  # scans in a row that may lie before an earlier one: more, the clock was set
+NOMINAL_STEP = 0.1  # [s] between scans whose stamps say nothing
+MAX_START = 1e3  # [s] of the first stamps of a clock that starts at 0
+MAX_CLOCK_OFFSET = 0.5  # [s] between two clocks that is ignored: delays of drivers and networks
+MAX_DETOUR = 1.02  # of the path in order of the stamps over that in order of the file
+MIN_OVERLAP = 0.9  # of the overlap in time of scans and odometry by stamps, over that otherwise
+
+
+class JoinedOdometry(NamedTuple):
+    """The odometry on a common axis with the scans, in order along it.
+
+    Attributes:
+        scan_axis: (T,) of the scans: seconds, or places in the file.
+        axis: (N,) of the odometry, ascending.
+        times: (N,) float64 [s] of the odometry by the clock of the scans.
+        poses: (N, 3) [m, m, rad].
+        notes: How it was joined, unless by the stamps as they are.
+    """
+
+    scan_axis: np.ndarray
+    axis: np.ndarray
+    times: np.ndarray
+    poses: np.ndarray
+    notes: tuple[str, ...] = ()
+
+
+def scan_times(stamps: Stamps) -> tuple[np.ndarray, list[str]]:
+    """Times of the scans.
+
+    Args:
+        stamps: Stamps of T scans in file order.
+
+    Returns:
+        (T,) float64 [s]: the stamps of the scans if they can be used; and notes if they cannot.
+    """
+    own, notes = _fill_zeros(stamps.own)
+    if are_distinct(own) and not is_set_back(own):
+        return own, notes
+    problem = "time stamps of the scans " + (
+        "are set back" if are_distinct(own) else "do not distinguish the scans"
+    )
+    received = stamps.received
+    if are_distinct(received) and not is_set_back(received):
+        return received, [f"{problem}: times of reception are used"]
+    if are_distinct(own):
+        return _continued(own), [f"{problem}: later ones are moved on, to follow in file order"]
+    if np.isfinite(own).all() and len(np.unique(own)) >= MIN_SPREAD * len(own):
+        spread = _spread(own)
+        if not is_set_back(spread):
+            return spread, [f"{problem}: equal ones are spread evenly, in file order"]
+    times = own[0] + NOMINAL_STEP * np.arange(len(own))
+    return times, [f"{problem}: they are made from the file order, {NOMINAL_STEP} s apart"]
+
+
+def are_distinct(times: np.ndarray, fraction: float = MIN_DISTINCT) -> bool:
+    """Whether times (N,) [s] are finite, and this fraction of them at least are different."""
+    return bool(np.isfinite(times).all()) and len(np.unique(times)) >= fraction * len(times)
+
+
+def is_set_back(times: np.ndarray) -> bool:
+    """Whether a clock was set back: many times (N,) [s] in a row lie before an earlier one.
+
+    Single times that are off, early or late, do not count.
+    """
+    behind = np.maximum.accumulate(_running_median(times)) > times
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], behind, [False]]).astype(int)))
+    return bool((edges[1::2] - edges[::2] > MAX_SCANS_BACK).any())
+
+
+def join(stamps: Stamps, times: np.ndarray, odometry: RawOdometry) -> JoinedOdometry:
+    """Join odometry with scans: by stamps if these can be used, by reception or order otherwise.
+
+    Args:
+        stamps: Stamps of T scans.
+        times: (T,) [s] of these, by `scan_times`.
+        odometry: N poses, N >= 1.
+    """
+    other = odometry.stamps
+    shift = _clock_offset(stamps, other)
+    stamped = np.array_equal(times, stamps.own)
+    candidates = []
+    if stamped and _follow_path(other.own, odometry):
+        candidates.append((stamps.own, other.own + shift, "stamp"))
+        if shift:
+            candidates.append((stamps.own, other.own, "stamp as it is"))
+    if _follow_path(other.received, odometry) and are_distinct(stamps.received):
+        candidates.append((stamps.received, other.received, "time of reception"))
+    candidates.append((stamps.order.astype(float), other.order.astype(float), "order in the file"))
+    overlaps = [_overlap(scan_axis, axis) for scan_axis, axis, _ in candidates]
+    chosen = next(i for i, x in enumerate(overlaps) if x >= MIN_OVERLAP * max(overlaps))
+    scan_axis, axis, name = candidates[chosen]
+    notes = []
+    if name == "stamp" and shift:
+        side = "behind" if shift < 0.0 else "ahead of"
+        notes.append(
+            f"clock of the scanner is {abs(shift):.2f} s {side} that of the odometry, by their "
+            "times of reception: the odometry is moved to it"
+        )
+    elif name in ("time of reception", "order in the file"):
+        notes.append(f"odometry is joined to the scans by {name}, not by time stamps")
+    if name.startswith("stamp"):
+        odom_times = axis
+    elif np.array_equal(times, scan_axis):
+        odom_times = axis
+    else:
+        odom_times = _mapped(axis, scan_axis, times)
+    order = np.argsort(axis, kind="stable")
+    poses = odometry.poses[order]
+    return JoinedOdometry(scan_axis, axis[order], odom_times[order], poses, tuple(notes))
+
+
+def _fill_zeros(times: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Times in which those that are 0 are interpolated, if most are not; and a note."""
+    known = np.flatnonzero(times)
+    if not known.size or known.size == len(times):
+        return times, []
+    started = np.maximum.accumulate(times) > 0.0
+    missing = (times == 0.0) & (started | (times[known[0]] > MAX_START))
+    if not missing.any() or missing.mean() > 0.5:
+        return times, []
+    index = np.arange(len(times))
+    known = np.flatnonzero(~missing)
+    step = float(np.median(np.diff(times[known]) / np.diff(known))) if known.size > 1 else 0.0
+    filled = np.interp(index, known, times[known])
+    filled -= step * (known[0] - index).clip(0)
+    filled += step * (index - known[-1]).clip(0)
+    filled[known] = times[known]
+    return filled, [f"{int(missing.sum())} time stamps are 0: they are interpolated in file order"]
+
+
+def _running_median(times: np.ndarray) -> np.ndarray:
+    """Median (N,) of each time and two on either side."""
+    padded = np.pad(times, 2, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+
+
+def _continued(times: np.ndarray) -> np.ndarray:
+    """Times in which each step back is replaced by the usual step forward."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else NOMINAL_STEP
+    return times[0] + np.concatenate([[0.0], np.cumsum(np.where(steps > 0.0, steps, usual))])
+
+
+def _spread(times: np.ndarray) -> np.ndarray:
+    """Times in which runs of equal ones are spread evenly up to the next."""
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(times) != 0.0]))
+    step = (times[starts[-1]] - times[0]) / max(starts[-1], 1)
+    end = times[starts[-1]] + step * (len(times) - starts[-1])
+    return np.interp(np.arange(len(times)), [*starts, len(times)], [*times[starts], end])
+
+
+def _clock_offset(scans: Stamps, odometry: Stamps) -> float:
+    """What to add to the odometry's stamps [s], as both were received by one clock; 0 if small."""
+    delay = scans.received - scans.own, odometry.received - odometry.own
+    if not np.isfinite(delay[0]).all() or not np.isfinite(delay[1]).all():
+        return 0.0
+    scan_delay, odometry_delay = np.median(delay[0]), np.median(delay[1])
+    spread = max(np.median(np.abs(delay[0] - scan_delay)), np.median(np.abs(delay[1] - odometry_delay)))
+    offset = float(odometry_delay - scan_delay)
+    return offset if abs(offset) > max(MAX_CLOCK_OFFSET, 5.0 * spread) else 0.0
+
+
+def _follow_path(times: np.ndarray, odometry: RawOdometry) -> bool:
+    """Whether times (N,) are distinct, and in their order the path is no longer than in the file's.
+
+    A clock that was set back would put two parts of a drive between each other.
+    """
+    if not are_distinct(times, MIN_DISTINCT_ODOMETRY):
+        return False
+    in_file = odometry.poses[np.argsort(odometry.stamps.order, kind="stable")]
+    in_time = sort_by_time(times, odometry.poses)[1]
+    return _path(in_time) <= MAX_DETOUR * _path(in_file) + 0.1
+
+
+def _path(poses: np.ndarray) -> float:
+    """Length of a path, to which a radian adds half a metre."""
+    steps = relative(poses[:-1], poses[1:])
+    return float(np.sum(np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])))
+
+
+def _overlap(scan_axis: np.ndarray, axis: np.ndarray) -> float:
+    """Fraction of the scans that lie within the odometry."""
+    return float(np.mean((scan_axis >= axis.min()) & (scan_axis <= axis.max())))
+
+
+def _mapped(axis: np.ndarray, scan_axis: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Times (N,) at places on the axis of the scans, beyond its ends at the mean rate."""
+    order = np.argsort(scan_axis, kind="stable")
+    scan_axis, times = scan_axis[order], times[order]
+    length = scan_axis[-1] - scan_axis[0]
+    rate = (times[-1] - times[0]) / length if length > 0.0 else 0.0
+    mapped = np.interp(axis, scan_axis, times)
+    return mapped + rate * (np.minimum(axis - scan_axis[0], 0.0) + np.maximum(axis - scan_axis[-1], 0.0))

@@ -133,7 +133,9 @@ def _one_scanner(
     keep = np.array([scan.frame == chosen for scan in raw.scans])
     scans = [scan for scan, use in zip(raw.scans, keep, strict=True) if use]
     poses = None if raw.scan_poses is None else raw.scan_poses[keep]
-    others = ", ".join(f"{name!r} ({count})" for name, count in sorted(counts.items()) if name != chosen)
+    others = ", ".join(
+        f"{name!r} ({count})" for name, count in sorted(counts.items()) if name != chosen
+    )
     note = f"scans of {chosen!r} are used, not those of {others}; --scan-frame chooses"
     return raw._replace(scans=scans, scan_poses=poses), [*raw.notes, note]
 

@@ -20,7 +20,7 @@ _OLD_BAG = b"#ROS"  # a bag of an older version, or of another
 _PACKED = {b"\x1f\x8b": "gunzip", b"BZh": "bunzip2", b"\x28\xb5\x2f\xfd": "zstd -d"}
 _SUFFIXES = (".bag", ".db3", ".mcap")
 ROS2_SUFFIXES = (".db3", ".mcap")
-HEAD = 16  # [bytes] that tell a format
+HEAD = 16  # [bytes] that show the format
 
 
 def is_bag(path: Path) -> bool:

@@ -113,9 +113,7 @@ def read_raw(path: str | PathLike) -> RawLog:
     )
 
 
-def _parse_odom(
-    line: int, fields: list[bytes]
-) -> tuple[float, float, int, float, float, float]:
+def _parse_odom(line: int, fields: list[bytes]) -> tuple[float, float, int, float, float, float]:
     """Stamp, time of logging, line and pose of an ODOM line; errors carry no line number."""
     if len(fields) != 10:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of 10")

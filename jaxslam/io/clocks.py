@@ -65,7 +65,8 @@ def scan_times(stamps: Stamps) -> tuple[np.ndarray, list[str]]:
         spread = _spread(own)
         if not is_set_back(spread):
             return spread, [f"{problem}: equal ones are spread evenly, in file order"]
-    times = own[0] + NOMINAL_STEP * np.arange(len(own))
+    start = own[0] if np.isfinite(own[0]) else 0.0
+    times = start + NOMINAL_STEP * np.arange(len(own))
     return times, [f"{problem}: they are made from the file order, {NOMINAL_STEP} s apart"]
 
 
@@ -172,7 +173,9 @@ def _clock_offset(scans: Stamps, odometry: Stamps) -> float:
     if not np.isfinite(delay[0]).all() or not np.isfinite(delay[1]).all():
         return 0.0
     scan_delay, odometry_delay = np.median(delay[0]), np.median(delay[1])
-    spread = max(np.median(np.abs(delay[0] - scan_delay)), np.median(np.abs(delay[1] - odometry_delay)))
+    spread = max(
+        np.median(np.abs(delay[0] - scan_delay)), np.median(np.abs(delay[1] - odometry_delay))
+    )
     offset = float(odometry_delay - scan_delay)
     return offset if abs(offset) > max(MAX_CLOCK_OFFSET, 5.0 * spread) else 0.0
 
@@ -207,4 +210,6 @@ def _mapped(axis: np.ndarray, scan_axis: np.ndarray, times: np.ndarray) -> np.nd
     length = scan_axis[-1] - scan_axis[0]
     rate = (times[-1] - times[0]) / length if length > 0.0 else 0.0
     mapped = np.interp(axis, scan_axis, times)
-    return mapped + rate * (np.minimum(axis - scan_axis[0], 0.0) + np.maximum(axis - scan_axis[-1], 0.0))
+    return mapped + rate * (
+        np.minimum(axis - scan_axis[0], 0.0) + np.maximum(axis - scan_axis[-1], 0.0)
+    )

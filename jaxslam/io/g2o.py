@@ -104,9 +104,7 @@ def _vertex_id(fields: list[bytes], count: int, index: int) -> int:
     return int(value)
 
 
-def _check_scans(
-    path: str | PathLike, scans: dict[int, RawScan], broken: dict[int, str]
-) -> None:
+def _check_scans(path: str | PathLike, scans: dict[int, RawScan], broken: dict[int, str]) -> None:
     """Raise if there are no scans, or more are broken than `MAX_BROKEN_FRACTION` allows."""
     total = len(scans) + len(broken)
     if not total:

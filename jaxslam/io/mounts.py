@@ -153,7 +153,7 @@ Joints = dict[str, list[tuple[str, np.ndarray]]]
 
 
 def _joints(transforms: Transforms, odom_frame: str | None) -> Joints:
-    """Transforms between frames of the robot, both ways, by the first value of each."""
+    """Transforms between frames of the robot and their inverses, by the first value of each."""
     joints: Joints = {}
     for (parent, child), transform in transforms.items():
         if _last(parent) in WORLD_FRAMES or _is_odom(parent, odom_frame):

@@ -24,6 +24,7 @@ MIN_EXTENT = np.array([0.01, 0.01, 0.02])  # [m, m, rad] that an odometry which 
 MIN_POSES = 10  # fewer may have that little extent
 MAX_LATCHED = 4  # repetitions of a pose by a late driver; after more, the robot stood still
 LEAP_RATIO = 1.5  # of size and speed of a leap after latched poses, over those beside it
+MAX_SHARED_RATIO = 2.0  # of the speed of a leap that is shared out, over the speed beside it
 MIN_LEAP = 0.02  # [m] of such a leap; a radian counts as half a metre
 NEIGHBOURS = 5  # steps on either side that the usual speed is taken from
 MAX_GAP = 3.5  # [s] without odometry that needs no note
@@ -124,10 +125,11 @@ def odometry_jumps(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
 def share_latched(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Share out leaps over the poses that were repeated before them.
 
-    Latched are at most `MAX_LATCHED` repetitions of a pose, amid motion, before a step that is
-    larger and faster than those beside it by `LEAP_RATIO`. What was driven meanwhile is known from the leap
-    as a whole: it is shared out by time. The increments are kept as a rough guess for a search,
-    and are marked, because they are not measured.
+    Latched are at most `MAX_LATCHED` repetitions of a pose, amid motion, before a step in the
+    direction of those beside it that is larger and faster than these by `LEAP_RATIO`, but not when
+    it is shared out. What was driven meanwhile is known from the leap as a whole: it is shared out
+    by time. These increments are a first guess for a search; they are marked, because they were
+    not measured.
 
     Args:
         times: (N,) [s].
@@ -140,7 +142,6 @@ def share_latched(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.
     steps = relative(poses[:-1], poses[1:])
     size = np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
     duration = np.maximum(np.abs(np.diff(times)), 1e-6)
-    speed = size / duration
     is_zero = size < 1e-9
     moving = np.flatnonzero(~is_zero)
     shared, is_shared, count = poses, np.zeros(len(poses), bool), 0
@@ -152,8 +153,14 @@ def share_latched(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.
         beside = np.concatenate(
             [moving[max(place - NEIGHBOURS, 0) : place], moving[place + 1 :][:NEIGHBOURS]]
         )
-        usual = LEAP_RATIO * np.median([size[beside], speed[beside]], axis=1)
-        if size[leap] <= usual[0] or speed[leap] <= usual[1]:
+        usual_speed = size[beside].sum() / duration[beside].sum()
+        shared_speed = size[leap] / duration[before + 1 : leap + 1].sum()
+        if (
+            size[leap] <= LEAP_RATIO * np.median(size[beside])
+            or size[leap] <= LEAP_RATIO * usual_speed * duration[leap]
+            or shared_speed > MAX_SHARED_RATIO * usual_speed
+            or np.dot(steps[leap], steps[beside].sum(axis=0)) <= 0.0
+        ):
             continue
         first, last = before + 1, leap + 1  # poses that the leap is shared out between
         ends = np.sort(times[[first, last]])

@@ -78,7 +78,5 @@ def logger_time(fields: list[bytes]) -> float:
 def _pose(fields: list[bytes]) -> tuple[float, float, float]:
     """Pose [m, m, rad] of the laser in a ROBOTLASER1 line."""
     names = ("laser_x", "laser_y", "laser_theta")
-    x, y, theta = (
-        number(field, name) for field, name in zip(fields[-14:-11], names, strict=True)
-    )
+    x, y, theta = (number(field, name) for field, name in zip(fields[-14:-11], names, strict=True))
     return x, y, theta

@@ -147,7 +147,9 @@ def _read_messages(path: str | PathLike, bag: Any, chosen: Topics, notes: list[s
             if scan is not None:
                 scans.append(scan)
         elif kind == ODOMETRY:
-            rows.append((_seconds(message.header.stamp), received, order, *_pose(message.pose.pose)))
+            rows.append(
+                (_seconds(message.header.stamp), received, order, *_pose(message.pose.pose))
+            )
             base_frame = base_frame or frame_name(message.child_frame_id)
         else:
             for one in message.transforms:
@@ -180,9 +182,7 @@ def _messages(
         if connection.topic in chosen or connection.msgtype in TRANSFORMS
     ]
     count = sum(connection.msgcount for connection in connections)
-    messages = with_progress(
-        bag.messages(connections=connections), Path(path), "message", count
-    )
+    messages = with_progress(bag.messages(connections=connections), Path(path), "message", count)
     for order, (connection, received, raw) in enumerate(messages):
         kind = connection.msgtype
         yield order, 1e-9 * received, kind, bag.deserialize(raw, kind)

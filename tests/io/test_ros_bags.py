@@ -206,14 +206,15 @@ def test_topics_can_be_named_and_wrong_ones_are_refused(tmp_path, ros):
         ros_bags.read(path, odometry_topic="/scan")
 
 
-def test_bags_without_scans_or_odometry_are_refused(tmp_path, ros):
-    path = write(place(tmp_path, ros), ros, poses="none", mount=False)
-    with pytest.raises(InputError, match="has no nav_msgs/msg/Odometry or tf2.*topics are: /scan"):
-        ros_bags.read(path)
-    other = tmp_path / "mount" / ("a.bag" if ros == 1 else "a")
-    other.parent.mkdir()
-    with pytest.raises(InputError, match="has no transform from 'odom'"):
-        ros_bags.read(write(other, ros, poses="none"))
+def test_bags_without_odometry_are_read_and_those_without_scans_refused(tmp_path, ros):
+    for mount in (False, True):
+        name = f"a{mount}.bag" if ros == 1 else f"a{mount}"
+        found = ros_bags.read(write(tmp_path / name, ros, poses="none", mount=mount))
+        assert not found.has_odometry and len(found.ranges) == SCANS and not found.odom_poses.any()
+        assert "no odometry: the log has none" in found.notes
+    name = "b.bag" if ros == 1 else "b"
+    with pytest.raises(InputError, match="has no sensor_msgs/msg/LaserScan; .*topics are: /odom"):
+        ros_bags.read(write(tmp_path / name, ros, scans=0))
     with pytest.raises(InputError, match="does not exist"):
         ros_bags.read(tmp_path / "none.bag")
 

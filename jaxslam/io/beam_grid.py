@@ -50,12 +50,10 @@ def to_grid(
         for scan, turned in zip(scans, backwards, strict=True)
     ]
     different = set(grids)
-    if len(different) == 1:
-        grid = grids[0]
-        target = _cut_at_seam(grid)
-        ranges = np.array(readings)
-        return (ranges if target == grid else ranges[:, _nearest(grid, target)]), target, []
-    target = _cut_at_seam(_common_grid(grids))
+    one_geometry = len(different) == 1
+    target = _cut_at_seam(grids[0] if one_geometry else _common_grid(grids))
+    if different == {target}:
+        return np.array(readings), target, []
     indices = {grid: _nearest(grid, target) for grid in different}
     ranges = np.array(
         [
@@ -63,7 +61,7 @@ def to_grid(
             for reading, grid in zip(readings, grids, strict=True)
         ]
     )
-    return ranges, target, _notes(grids, target)
+    return ranges, target, [] if one_geometry else _notes(grids, target)
 
 
 def _grid_of(scan: RawScan, upside_down: bool, angle_increment: float | None) -> BeamGrid:
@@ -109,11 +107,11 @@ def _cut_at_seam(grid: BeamGrid) -> BeamGrid:
 def _nearest(grid: BeamGrid, target: BeamGrid) -> np.ndarray:
     """Index of the beam nearest to each angle of the target; one past the last if too far."""
     angles = target.angle_min + target.angle_increment * np.arange(target.num_beams)
-    place = (angles - grid.angle_min) / grid.angle_increment
     turn = 2 * math.pi / grid.angle_increment
+    place = np.remainder((angles - grid.angle_min) / grid.angle_increment, turn)
     near = np.full(angles.shape, grid.num_beams)
     least = np.full(angles.shape, REACH * target.angle_increment / grid.angle_increment)
-    for shifted in (place, place - turn, place + turn):
+    for shifted in (place, place - turn):
         beam = np.round(shifted).clip(0, grid.num_beams - 1)
         distance = np.abs(shifted - beam)
         better = distance < least - SAME_STEP

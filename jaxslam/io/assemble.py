@@ -12,7 +12,7 @@ from jaxslam.core.logs import DEFAULT_RANGE_MAX, LaserLog, mark_no_return
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2_np import compose
 from jaxslam.io import clocks
-from jaxslam.io.beam_grid import to_grid
+from jaxslam.io.beam_grid import are_usual, to_grid
 from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.mounts import Mount, find_mount, frame_name, odometry_of_transforms
 from jaxslam.io.raw_log import RawLog, RawScan, stamps_of
@@ -73,6 +73,10 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
     """
     check_options(options)
     raw, notes = _one_scanner(path, raw, options.scan_frame)
+    usual = are_usual(raw.scans)
+    if not usual.all():
+        raw = _select(raw, usual)
+        notes.append(f"scans with another step between beams are left out: {int((~usual).sum())}")
     frame = raw.scans[0].frame
     raw, more = _with_odometry(path, raw, frame, options)
     notes += more
@@ -87,9 +91,7 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
     track, more = track_scans(path, raw, times, joined)
     notes += more
     if not track.inside.all():
-        scans = [scan for scan, use in zip(raw.scans, track.inside, strict=True) if use]
-        skipped = raw.num_skipped + len(raw.scans) - len(scans)
-        raw = raw._replace(scans=scans, num_skipped=skipped)
+        raw = _select(raw, track.inside)
     ranges, grid, more = to_grid(
         raw.scans, upside_down=mount.upside_down, angle_increment=options.angle_increment
     )
@@ -131,13 +133,20 @@ def _one_scanner(
     if len(counts) == 1:
         return raw, list(raw.notes)
     keep = np.array([scan.frame == chosen for scan in raw.scans])
-    scans = [scan for scan, use in zip(raw.scans, keep, strict=True) if use]
-    poses = None if raw.scan_poses is None else raw.scan_poses[keep]
     others = ", ".join(
         f"{name!r} ({count})" for name, count in sorted(counts.items()) if name != chosen
     )
     note = f"scans of {chosen!r} are used, not those of {others}; --scan-frame chooses"
-    return raw._replace(scans=scans, scan_poses=poses), [*raw.notes, note]
+    one = _select(raw, keep)._replace(num_skipped=raw.num_skipped)
+    return one, [*raw.notes, note]
+
+
+def _select(raw: RawLog, keep: np.ndarray) -> RawLog:
+    """The log with some of its scans; the others count as skipped."""
+    scans = [scan for scan, use in zip(raw.scans, keep, strict=True) if use]
+    poses = None if raw.scan_poses is None else raw.scan_poses[keep]
+    skipped = raw.num_skipped + len(raw.scans) - len(scans)
+    return raw._replace(scans=scans, scan_poses=poses, num_skipped=skipped)
 
 
 def _with_odometry(

@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.core.logs import MAX_BROKEN_FRACTION
 from jaxslam.io.raw_log import RawScan
 
+MAX_STEP_CHANGE = 0.03  # of the step between beams, by the speed of a motor
 SAME_STEP = 1e-9  # [rad] within which steps and first angles are the same
 REACH = 0.75  # of a step: how far a beam may be from the angle of the grid that takes its reading
 SEAM_TOLERANCE = 0.5  # of a step that a scan may pass -pi or pi without being cut there
@@ -25,6 +27,25 @@ class BeamGrid(NamedTuple):
     num_beams: int
     angle_min: float
     angle_increment: float
+
+
+def are_usual(scans: list[RawScan]) -> np.ndarray:
+    """Whether scans are like most others: not one of a few with another step between beams.
+
+    Where nearly all scans agree, a few others were cut, or say something wrong of themselves: often
+    the first. Steps that vary in many scans are those of a motor, and usual.
+
+    Args:
+        scans: T scans.
+
+    Returns:
+        (T,) bool, False for at most `MAX_BROKEN_FRACTION` of them, or for one.
+    """
+    steps = np.array([scan.angle_increment for scan in scans])
+    usual = np.median(steps)
+    like = np.abs(steps - usual) <= MAX_STEP_CHANGE * abs(usual)
+    few = (~like).sum() <= max(MAX_BROKEN_FRACTION * len(scans), 1) and like.sum() > 1
+    return like if few else np.ones(len(scans), bool)
 
 
 def to_grid(

@@ -52,7 +52,7 @@ def test_a_full_turn_begins_near_minus_pi_wherever_its_seam_is(first, step, upsi
     one = scan_of(first, step, 120, upside_down=upside_down)
     ranges, grid, notes = beam_grid.to_grid([one], upside_down=upside_down)
     assert notes == [] and grid.num_beams == 120
-    assert -np.pi - 0.5 * abs(step) <= grid.angle_min < -np.pi + abs(step)
+    assert -np.pi - 0.5 * abs(step) <= grid.angle_min <= -np.pi + 1.01 * abs(step)
     np.testing.assert_allclose(ranges[0], wall(angles_of(grid)), atol=1e-9)
 
 
@@ -76,6 +76,16 @@ def test_counts_that_vary_are_put_on_one_grid():
     for one in ranges:
         assert_sees_the_wall(one, grid, least=0.99, within=1.0)
     assert len(notes) == 1 and "beams: they are put on one grid of" in notes[0]
+
+
+def test_a_few_scans_of_another_step_are_unusual_and_many_are_not():
+    usual, odd = scan_of(-1.0, 0.1, 20), scan_of(-1.0, 0.11, 20)
+    right = [False, *[True] * 9]
+    np.testing.assert_array_equal(beam_grid.are_usual([odd, *[usual] * 9]), right)
+    assert beam_grid.are_usual([odd] * 3 + [usual] * 9).all()
+    assert beam_grid.are_usual([odd]).all() and beam_grid.are_usual([odd, usual]).all()
+    motor = [scan_of(0.0, FULL / n, n) for n in (453, 454, 455, 456, 457)]
+    assert beam_grid.are_usual(motor).all()
 
 
 def test_a_single_odd_scan_does_not_change_the_grid():

@@ -17,6 +17,9 @@ from jaxslam.io.errors import InputError, check_range_max
 from jaxslam.io.mounts import Mount, find_mount, frame_name, odometry_of_transforms
 from jaxslam.io.raw_log import RawLog, RawScan, stamps_of
 from jaxslam.io.scan_odometry import track_scans
+from jaxslam.io.scan_rotation import compare_rotations
+
+MAX_NAMED = 5  # other scanners that a note names
 
 
 class LogOptions(NamedTuple):
@@ -85,17 +88,20 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
     notes += more
     times, more = clocks.scan_times(stamps_of(raw.scans))
     notes += more
-    joined = None
-    if len(raw.odometry.poses):
-        joined = clocks.join(stamps_of(raw.scans), times, raw.odometry)
-    track, more = track_scans(path, raw, times, joined)
-    notes += more
-    if not track.inside.all():
-        raw = _select(raw, track.inside)
     ranges, grid, more = to_grid(
         raw.scans, upside_down=mount.upside_down, angle_increment=options.angle_increment
     )
     notes += more
+    joined = None
+    if len(raw.odometry.poses):
+        joined = clocks.join(stamps_of(raw.scans), times, raw.odometry)
+        if raw.scan_poses is None:
+            joined = _on_one_clock(joined, ranges, grid.angle_increment)
+            times = joined.scan_times
+    track, more = track_scans(path, raw, times, joined)
+    notes += more
+    if not track.inside.all():
+        raw, ranges = _select(raw, track.inside), ranges[track.inside]
     range_max = _range_max(path, raw.scans, options.range_max)
     lidar = Lidar(*grid, range_max, raw.range_std)
     ranges = mark_no_return(ranges, range_max)
@@ -134,7 +140,7 @@ def _one_scanner(
         return raw, list(raw.notes)
     keep = np.array([scan.frame == chosen for scan in raw.scans])
     others = ", ".join(
-        f"{name!r} ({count})" for name, count in sorted(counts.items()) if name != chosen
+        f"{name!r} ({count})" for name, count in counts.most_common(MAX_NAMED + 1) if name != chosen
     )
     note = f"scans of {chosen!r} are used, not those of {others}; --scan-frame chooses"
     one = _select(raw, keep)._replace(num_skipped=raw.num_skipped)
@@ -179,6 +185,22 @@ def _mount(
     else:
         mount, notes = Mount(np.zeros(3), False), []
     return (mount._replace(upside_down=True) if options.upside_down else mount), notes
+
+
+def _on_one_clock(
+    joined: clocks.JoinedOdometry, ranges: np.ndarray, step: float
+) -> clocks.JoinedOdometry:
+    """The scans, moved in time to the odometry if the turns of both say so."""
+    if not joined.by_time:
+        return joined
+    behind, notes = compare_rotations(
+        joined.scan_axis, ranges, step, joined.axis, joined.poses[:, 2]
+    )
+    return joined._replace(
+        scan_times=joined.scan_times + behind,
+        scan_axis=joined.scan_axis + behind,
+        notes=(*joined.notes, *notes),
+    )
 
 
 def _on_scanner(raw: RawLog, mount: np.ndarray) -> RawLog:

@@ -27,17 +27,21 @@ class JoinedOdometry(NamedTuple):
     """The odometry on a common axis with the scans, in order along it.
 
     Attributes:
+        scan_times: (T,) float64 [s] of the scans, with their clock corrected if it is off.
         scan_axis: (T,) of the scans: seconds, or places in the file.
+        times: (N,) float64 [s] of the odometry by the clock of `scan_times`.
         axis: (N,) of the odometry, ascending.
-        times: (N,) float64 [s] of the odometry by the clock of the scans.
         poses: (N, 3) [m, m, rad].
+        by_time: Whether the axis is time.
         notes: How it was joined, unless by the stamps as they are.
     """
 
+    scan_times: np.ndarray
     scan_axis: np.ndarray
-    axis: np.ndarray
     times: np.ndarray
+    axis: np.ndarray
     poses: np.ndarray
+    by_time: bool = True
     notes: tuple[str, ...] = ()
 
 
@@ -88,43 +92,79 @@ def is_set_back(times: np.ndarray) -> bool:
 def join(stamps: Stamps, times: np.ndarray, odometry: RawOdometry) -> JoinedOdometry:
     """Join odometry with scans: by stamps if these can be used, by reception or order otherwise.
 
+    Where the two clocks differ, by the times of reception, the one that is off is corrected.
+
     Args:
         stamps: Stamps of T scans.
         times: (T,) [s] of these, by `scan_times`.
         odometry: N poses, N >= 1.
     """
     other = odometry.stamps
-    shift = _clock_offset(stamps, other)
-    stamped = np.array_equal(times, stamps.own)
-    candidates = []
-    if stamped and _follow_path(other.own, odometry):
-        candidates.append((stamps.own, other.own + shift, "stamp"))
-        if shift:
-            candidates.append((stamps.own, other.own, "stamp as it is"))
-    if _follow_path(other.received, odometry) and are_distinct(stamps.received):
-        candidates.append((stamps.received, other.received, "time of reception"))
-    candidates.append((stamps.order.astype(float), other.order.astype(float), "order in the file"))
-    overlaps = [_overlap(scan_axis, axis) for scan_axis, axis, _ in candidates]
+    by_stamps, notes = _clocks_corrected(stamps, times, other)
+    options = []
+    if np.array_equal(times[stamps.own != 0.0], stamps.own[stamps.own != 0.0]) and _follow_path(
+        other.own, odometry
+    ):
+        options += [("time stamps", *by_stamps), ("time stamps", times, other.own)]
+    if are_distinct(stamps.received) and _follow_path(other.received, odometry):
+        options.append(("time of reception", stamps.received, other.received))
+    options.append(("order in the file", stamps.order, other.order))
+    overlaps = [_overlap(scan_axis, axis) for _, scan_axis, axis in options]
     chosen = next(i for i, x in enumerate(overlaps) if x >= MIN_OVERLAP * max(overlaps))
-    scan_axis, axis, name = candidates[chosen]
-    notes = []
-    if name == "stamp" and shift:
-        side = "behind" if shift < 0.0 else "ahead of"
-        notes.append(
-            f"clock of the scanner is {abs(shift):.2f} s {side} that of the odometry, by their "
-            "times of reception: the odometry is moved to it"
-        )
-    elif name in ("time of reception", "order in the file"):
-        notes.append(f"odometry is joined to the scans by {name}, not by time stamps")
-    if name.startswith("stamp"):
-        odom_times = axis
-    elif np.array_equal(times, scan_axis):
-        odom_times = axis
+    name, scan_axis, axis = options[chosen]
+    odom_times = axis
+    if name == "time stamps":
+        times, notes = scan_axis, notes if chosen == 0 else []
     else:
-        odom_times = _mapped(axis, scan_axis, times)
+        notes = [f"odometry is joined to the scans by {name}, not by time stamps"]
+        if not np.array_equal(times, scan_axis):
+            odom_times = _mapped(axis, scan_axis, times)
     order = np.argsort(axis, kind="stable")
-    poses = odometry.poses[order]
-    return JoinedOdometry(scan_axis, axis[order], odom_times[order], poses, tuple(notes))
+    return JoinedOdometry(
+        scan_times=times,
+        scan_axis=scan_axis,
+        times=odom_times[order],
+        axis=axis[order],
+        poses=odometry.poses[order],
+        by_time=name != "order in the file",
+        notes=tuple(notes),
+    )
+
+
+def _clocks_corrected(
+    scans: Stamps, times: np.ndarray, odometry: Stamps
+) -> tuple[tuple[np.ndarray, np.ndarray], list[str]]:
+    """Times of scans and odometry on one clock, if both were received by one; and a note.
+
+    The clock that is further from that of the reception is corrected.
+    """
+    unchanged = times, odometry.own
+    delays = [x.received - x.own for x in (scans, odometry)]
+    if not all(np.isfinite(delay).all() for delay in delays):
+        return unchanged, []
+    scan_delay, odometry_delay = (float(np.median(delay)) for delay in delays)
+    spread = max(
+        float(np.median(np.abs(delay - middle)))
+        for delay, middle in zip(delays, (scan_delay, odometry_delay), strict=True)
+    )
+    behind = scan_delay - odometry_delay
+    if abs(behind) <= max(MAX_CLOCK_OFFSET, 5.0 * spread):
+        return unchanged, []
+    move_scans = abs(scan_delay) > abs(odometry_delay)
+    note = offset_note(behind, "their times of reception", move_scans=move_scans)
+    if move_scans:
+        return (times + behind, odometry.own), [note]
+    return (times, odometry.own - behind), [note]
+
+
+def offset_note(behind: float, evidence: str, *, move_scans: bool = True) -> str:
+    """A note that the clock of the scanner is `behind` [s] that of the odometry."""
+    side = "behind" if behind > 0.0 else "ahead of"
+    moved = "the scans are" if move_scans else "the odometry is"
+    return (
+        f"clock of the scanner is {abs(behind):.2f} s {side} that of the odometry, by {evidence}: "
+        f"{moved} moved to the other"
+    )
 
 
 def _fill_zeros(times: np.ndarray) -> tuple[np.ndarray, list[str]]:
@@ -165,19 +205,6 @@ def _spread(times: np.ndarray) -> np.ndarray:
     step = (times[starts[-1]] - times[0]) / max(starts[-1], 1)
     end = times[starts[-1]] + step * (len(times) - starts[-1])
     return np.interp(np.arange(len(times)), [*starts, len(times)], [*times[starts], end])
-
-
-def _clock_offset(scans: Stamps, odometry: Stamps) -> float:
-    """What to add to the odometry's stamps [s], as both were received by one clock; 0 if small."""
-    delay = scans.received - scans.own, odometry.received - odometry.own
-    if not np.isfinite(delay[0]).all() or not np.isfinite(delay[1]).all():
-        return 0.0
-    scan_delay, odometry_delay = np.median(delay[0]), np.median(delay[1])
-    spread = max(
-        np.median(np.abs(delay[0] - scan_delay)), np.median(np.abs(delay[1] - odometry_delay))
-    )
-    offset = float(odometry_delay - scan_delay)
-    return offset if abs(offset) > max(MAX_CLOCK_OFFSET, 5.0 * spread) else 0.0
 
 
 def _follow_path(times: np.ndarray, odometry: RawOdometry) -> bool:

@@ -24,6 +24,7 @@ from jaxslam.io.text import lines, number
 LASER, POSITIONS = b"laser", (b"position2d", b"position")
 HEADER_FIELDS = 5  # time host robot interface index
 DATA = (b"001", b"1")  # type of a message that is data, and its subtype
+MAX_NAMED = 5  # other sources of odometry that a note names
 MAX_HEAD = 8  # fields between those of the header and the ranges, at most
 _FORM = (
     "time host robot laser index [type subtype] min_angle max_angle resolution [max_range] count "
@@ -89,14 +90,19 @@ def read_raw(path: str | PathLike) -> RawLog:
     rows = odometry.get(chosen, [])
     notes = []
     if len(odometry) > 1:
-        others = ", ".join(sorted(name.decode() for name in odometry if name != chosen))
-        notes.append(f"odometry of {chosen.decode()!r} is used, not of {others}")
+        others = ", ".join(map(_text, sorted(odometry.keys() - {chosen})[:MAX_NAMED]))
+        notes.append(f"odometry of {_text(chosen)!r} is used, not of {others}")
     return RawLog(
         scans=scans,
         odometry=as_odometry(_in_radians(rows) if chosen.startswith(b"position ") else rows),
         num_skipped=len(broken),
         notes=tuple(notes),
     )
+
+
+def _text(field: bytes) -> str:
+    """A field as text, shortened."""
+    return field[:20].decode("utf-8", "replace")
 
 
 def _is_data(fields: list[bytes]) -> bool:
@@ -116,7 +122,7 @@ def _parse_laser(line: int, fields: list[bytes]) -> RawScan:
     first, last, step, range_max = _angles(values, num_beams)
     ranges = np.array(numbers[::2] if len(numbers) == 2 * num_beams else numbers)
     scale = math.pi / 180 if max(abs(first), abs(last)) > 2 * math.pi else 1.0
-    frame = f"laser {fields[4].decode('utf-8', 'replace')}"
+    frame = f"laser {_text(fields[4])}"
     step = math.copysign(step, last - first) * scale
     return RawScan(time, math.nan, line, frame, first * scale, step, range_max, ranges)
 

@@ -9,6 +9,7 @@ from jaxslam.core.time_series import interpolate_poses
 from jaxslam.io.clocks import JoinedOdometry
 from jaxslam.io.errors import InputError
 from jaxslam.io.odometry_checks import (
+    MIN_OVERLAP,
     CheckedOdometry,
     check_odometry,
     missing_spans,
@@ -107,9 +108,7 @@ def _track_with_poses(
         track = Track(inside, checked.poses, checked.is_stale, times, checked.poses, checked.usable)
         return track, notes
     stream = check_odometry(joined.times, joined.poses)
-    corrected = raw.poses_may_be_corrected and poses_are_corrected(
-        joined.scan_axis, scan_poses, joined.axis, joined.poses
-    )
+    corrected = raw.poses_may_be_corrected and _are_corrected(raw, scan_poses, joined)
     if stream.usable and (corrected or stream.restarts or not checked.usable):
         notes = [*joined.notes, *stream.notes]
         if corrected or not checked.usable:
@@ -125,6 +124,17 @@ def _track_with_poses(
         Track(inside, checked.poses, checked.is_stale, stream_times, stream_poses, checked.usable),
         notes,
     )
+
+
+def _are_corrected(raw: RawLog, scan_poses: np.ndarray, joined: JoinedOdometry) -> bool:
+    """Whether poses differ from the odometry by time and by order: their clocks may differ."""
+    if not poses_are_corrected(joined.scan_axis, scan_poses, joined.axis, joined.poses):
+        return False
+    scan_order, order = stamps_of(raw.scans).order, raw.odometry.stamps.order
+    inside = (scan_order >= order[0]) & (scan_order <= order[-1])
+    if inside.mean() < MIN_OVERLAP:
+        return True
+    return poses_are_corrected(scan_order, scan_poses, order, raw.odometry.poses)
 
 
 def _standing(times: np.ndarray) -> Track:

@@ -292,6 +292,33 @@ def test_broken_scans_of_the_newer_toolkit_are_reported(tmp_path):
     assert not carmen.read(still).has_odometry
 
 
+def test_raw_scans_take_their_odometry_from_odom_lines(tmp_path):
+    scan = "RAWLASER1 0 -0.75 2.0 0.5 8.0 0.01 0 4 1 2 30 4 1 0.5"
+    lines = [line for t in range(20) for line in (odom(t), f"{scan} {t + 0.5} host {t}")]
+    log = carmen.read(save(tmp_path / "a.clf", lines))
+    assert log.lidar == lidar_of(4, -0.75, 0.5, 8.0) and len(log.times) == 19
+    np.testing.assert_allclose(log.odom_poses[:, 0], 0.1 * (np.arange(19) + 0.5))
+    assert log.num_skipped == 1 and "1 after it ends" in log.notes[0]
+    twice = [line for t in range(20) for line in (robotlaser(t, pose=(t, 0, 0)), lines[2 * t + 1])]
+    assert len(carmen.read(save(tmp_path / "b.clf", twice)).times) == 20
+
+
+@pytest.mark.parametrize("name", ["robot_frontlaser", "laser_front_laser"])
+def test_parameters_place_the_front_laser(tmp_path, name):
+    lines = [
+        f"PARAM {name}_offset 0.25 976052857.2 host 0.1",
+        f"PARAM {name}_side_offset -0.1 976052857.2 host 0.1",
+        f"PARAM {name}_angular_offset 0.5 976052857.2 host 0.1",
+        f"PARAM {name}_offset",
+        "PARAM robot_name pioneer 0 host 0",
+    ]
+    mount = np.array([0.25, -0.1, 0.5])
+    log = carmen.read(save(tmp_path / "a.clf", lines + drive(true_pose, true_pose)))
+    np.testing.assert_allclose(log.mount, mount)
+    wanted = compose(np.array([true_pose(t) for t in log.times]), mount)
+    np.testing.assert_allclose(relative(log.odom_poses, wanted), 0.0, atol=1e-9)
+
+
 def true_pose(t):
     """A drive of 1 m/s along an arc."""
     return np.array([10 * np.sin(0.1 * t), 10 - 10 * np.cos(0.1 * t), 0.1 * t])

@@ -236,3 +236,107 @@ def test_damaged_bags_never_end_in_a_traceback(tmp_path, ros):
             assert np.isfinite(ros_bags.read(path).odom_poses).all()
         except InputError as error:
             assert "\n" not in str(error)
+
+
+def write_messages(path, said, ros=2):
+    """A bag of (time, topic, type, message)."""
+    store = Maker(ros).store
+    with rosbag2.Writer(path, version=9) as writer:
+        known = {}
+        for t, topic, kind, message in said:
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(known[topic], int(1e9 * (START + t)), store.serialize_cdr(message, kind))
+    return path
+
+
+def with_wheels(*makers, count=12):
+    """Messages of the wheels, and of each function (i, time) a (topic, type, message)."""
+    make, said = Maker(2), []
+    for i in range(count):
+        said.append((float(i), "/odom", ros_bags.ODOMETRY, make.odometry(float(i), pose_at(i))))
+        said += [
+            (i + 0.5 - 0.5 * (i == count - 1), *one) for one in (f(make, i) for f in makers) if one
+        ]
+    return said
+
+
+def scan_from(frame, topic="/scan", every=1, offset=0.0):
+    def message(make, i):
+        if i % every:
+            return None
+        return topic, ros_bags.SCAN, make.scan(i + 0.4, ranges()[i % SCANS] + offset, frame=frame)
+
+    return message
+
+
+def test_two_scanners_on_one_topic_are_not_mixed(tmp_path):
+    said = with_wheels(scan_from("front"), scan_from("rear", every=2, offset=1.0))
+    path = write_messages(tmp_path / "a", said)
+    found = readers.read_log(path)
+    assert len(found.times) == 11 and np.array_equal(found.ranges[:8], ranges())
+    assert any("scans of 'front' are used, not those of 'rear' (6)" in x for x in found.notes)
+    rear = readers.read_log(path, scan_frame="/rear")
+    assert len(rear.times) == 6 and np.array_equal(rear.ranges[0], ranges()[0] + 1)
+
+
+def test_of_two_scanners_the_one_with_most_scans_is_named(tmp_path):
+    said = with_wheels(scan_from("front", every=3), scan_from("rear", "/scan_rear"))
+    path = write_messages(tmp_path / "a", said)
+    found = readers.read_log(path)
+    assert ", scans of /scan_rear" in found.source
+    assert any("not of /scan (4); --scan-topic chooses" in note for note in found.notes)
+    assert len(readers.read_log(path, scan_topic="/scan").times) == 4
+
+
+def test_of_several_echoes_the_first_is_read(tmp_path):
+    def message(make, i):
+        echo, one = make.of["sensor_msgs/msg/LaserEcho"], make.scan(i + 0.4, ranges()[i % SCANS])
+        beams = [echo(np.array([r, r + 1], np.float32)) for r in one.ranges]
+        beams[2] = echo(np.zeros(0, np.float32))
+        many = make.of[ros_bags.MULTI_ECHO](
+            one.header, one.angle_min, one.angle_max, one.angle_increment, 0.0, 0.1, LEAST, MOST,
+            beams, [],
+        )  # fmt: skip
+        return "/echoes", ros_bags.MULTI_ECHO, many
+
+    found = ros_bags.read(write_messages(tmp_path / "a", with_wheels(message)))
+    right = ranges().copy()
+    right[:, 2] = np.inf
+    np.testing.assert_array_equal(found.ranges[:8], right)
+
+
+@pytest.mark.parametrize("range_max", [np.inf, 0.0, np.nan])
+def test_a_range_max_that_is_not_stated_is_the_usual_one(tmp_path, range_max):
+    def message(make, i):
+        one = make.scan(i + 0.4, ranges()[i % SCANS])
+        one.range_max = range_max
+        return "/scan", ros_bags.SCAN, one
+
+    path = write_messages(tmp_path / "a", with_wheels(message))
+    found = ros_bags.read(path)
+    assert found.lidar.range_max == 20.0 and np.array_equal(found.ranges[:8], ranges())
+    assert ros_bags.read(path, range_max=30.0).lidar.range_max == 30.0
+    with pytest.raises(InputError, match="and the log states none"):
+        ros_bags.read(path, range_max=np.inf)
+
+
+def test_a_step_that_is_not_stated_follows_from_the_angles(tmp_path):
+    def message(make, i):
+        one = make.scan(i + 0.4, ranges()[i % SCANS])
+        one.angle_increment = 0.0
+        return "/scan", ros_bags.SCAN, one
+
+    found = ros_bags.read(write_messages(tmp_path / "a", with_wheels(message)))
+    assert found.lidar.angle_increment == pytest.approx(STEP) and found.num_skipped == 1
+
+
+def test_scans_without_angles_are_broken(tmp_path):
+    def message(make, i):
+        one = make.scan(i + 0.4, ranges()[i % SCANS])
+        one.angle_min = np.nan
+        return "/scan", ros_bags.SCAN, one
+
+    path = write_messages(tmp_path / "a", with_wheels(message))
+    with pytest.raises(InputError, match="12 of 12 scans of /scan are broken"):
+        ros_bags.read(path)

@@ -86,7 +86,7 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
     mount, more = _mount(path, raw, frame, options)
     raw = _on_scanner(raw, mount.pose)
     notes += more
-    times, more = clocks.scan_times(stamps_of(raw.scans))
+    times, more = clocks.scan_times(stamps_of(raw.scans), raw.scan_poses)
     notes += more
     ranges, grid, more = to_grid(
         raw.scans, upside_down=mount.upside_down, angle_increment=options.angle_increment
@@ -191,7 +191,7 @@ def _on_one_clock(
     joined: clocks.JoinedOdometry, ranges: np.ndarray, step: float
 ) -> clocks.JoinedOdometry:
     """The scans, moved in time to the odometry if the turns of both say so."""
-    if not joined.by_time:
+    if not joined.is_time:
         return joined
     behind, notes = compare_rotations(
         joined.scan_axis, ranges, step, joined.axis, joined.poses[:, 2]

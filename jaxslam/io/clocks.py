@@ -16,7 +16,8 @@ MIN_DISTINCT = 0.9  # least fraction of the scans' stamps that must differ from 
 MIN_DISTINCT_ODOMETRY = 0.5  # likewise of the odometry, which some robots send twice
 MIN_SPREAD = 0.1  # least fraction of stamps that differ, so that equal ones are spread in between
 MAX_SCANS_BACK = 10  # scans in a row that may lie before an earlier one: more, the clock was set
-NOMINAL_STEP = 0.1  # [s] between scans whose stamps say nothing
+NOMINAL_STEP = 0.1  # [s] between scans whose stamps say nothing, at least
+NOMINAL_SPEED = 0.5  # [m/s] of a robot at that time; a radian counts as half a metre
 MAX_START = 1e3  # [s] of the first stamps of a clock that starts at 0
 MAX_CLOCK_OFFSET = 0.5  # [s] between two clocks that is ignored: delays of drivers and networks
 MAX_DETOUR = 1.02  # of the path in order of the stamps over that in order of the file
@@ -32,7 +33,7 @@ class JoinedOdometry(NamedTuple):
         times: (N,) float64 [s] of the odometry by the clock of `scan_times`.
         axis: (N,) of the odometry, ascending.
         poses: (N, 3) [m, m, rad].
-        by_time: Whether the axis is time.
+        is_time: Whether the axis is time.
         notes: How it was joined, unless by the stamps as they are.
     """
 
@@ -41,15 +42,17 @@ class JoinedOdometry(NamedTuple):
     times: np.ndarray
     axis: np.ndarray
     poses: np.ndarray
-    by_time: bool = True
+    is_time: bool = True
     notes: tuple[str, ...] = ()
 
 
-def scan_times(stamps: Stamps) -> tuple[np.ndarray, list[str]]:
+def scan_times(stamps: Stamps, poses: np.ndarray | None = None) -> tuple[np.ndarray, list[str]]:
     """Times of the scans.
 
     Args:
         stamps: Stamps of T scans in file order.
+        poses: (T, 3) [m, m, rad] of the scans, if known: where times must be made, the robot is not
+            made faster than `NOMINAL_SPEED` in nearly all steps.
 
     Returns:
         (T,) float64 [s]: the stamps of the scans if they can be used; and notes if they cannot.
@@ -70,8 +73,11 @@ def scan_times(stamps: Stamps) -> tuple[np.ndarray, list[str]]:
         if not is_set_back(spread):
             return spread, [f"{problem}: equal ones are spread evenly, in file order"]
     start = own[0] if np.isfinite(own[0]) else 0.0
-    times = start + NOMINAL_STEP * np.arange(len(own))
-    return times, [f"{problem}: they are made from the file order, {NOMINAL_STEP} s apart"]
+    step = NOMINAL_STEP
+    if poses is not None and len(poses) > 1:
+        step = max(step, round(float(np.quantile(_sizes(poses), 0.95)) / NOMINAL_SPEED, 1))
+    times = start + step * np.arange(len(own))
+    return times, [f"{problem}: they are made from the file order, {step:g} s apart"]
 
 
 def are_distinct(times: np.ndarray, fraction: float = MIN_DISTINCT) -> bool:
@@ -126,7 +132,7 @@ def join(stamps: Stamps, times: np.ndarray, odometry: RawOdometry) -> JoinedOdom
         times=odom_times[order],
         axis=axis[order],
         poses=odometry.poses[order],
-        by_time=name != "order in the file",
+        is_time=name != "order in the file",
         notes=tuple(notes),
     )
 
@@ -221,8 +227,13 @@ def _follow_path(times: np.ndarray, odometry: RawOdometry) -> bool:
 
 def _path(poses: np.ndarray) -> float:
     """Length of a path, to which a radian adds half a metre."""
+    return float(np.sum(_sizes(poses)))
+
+
+def _sizes(poses: np.ndarray) -> np.ndarray:
+    """Sizes (N - 1,) [m] of the steps of a path (N, 3); a radian counts as half a metre."""
     steps = relative(poses[:-1], poses[1:])
-    return float(np.sum(np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])))
+    return np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
 
 
 def _overlap(scan_axis: np.ndarray, axis: np.ndarray) -> float:

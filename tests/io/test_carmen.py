@@ -378,6 +378,13 @@ def test_odometry_that_restarts_goes_on_where_it_was(tmp_path):
     assert len(log.notes) == 1 and np.hypot(*np.diff(log.odom_poses, axis=0).T[:2]).max() < 1.1
 
 
+def test_keyframes_far_apart_without_stamps_are_no_jumps(tmp_path):
+    lines = [flaser(0, pose=true_pose(3.0 * t)) for t in range(40)]
+    log = carmen.read(save(tmp_path / "a.clf", lines))
+    assert log.has_odometry and len(log.notes) == 1 and "s apart" in log.notes[0]
+    np.testing.assert_allclose(log.odom_poses, [true_pose(3.0 * t) for t in range(40)])
+
+
 def test_odometry_that_jumps_all_the_time_is_none(tmp_path):
 
     def thrown(t):

@@ -6,7 +6,8 @@ The writers are independent of the readers: plain text, NumPy, and rosbags' own.
 from typing import NamedTuple
 
 import numpy as np
-import test_ros_bags
+from bag_messages import START as BAG_START
+from bag_messages import Maker
 from rosbags import rosbag1, rosbag2
 
 from jaxslam.core.scan import Lidar
@@ -99,8 +100,8 @@ def player(path, said, *, old=False):
 
 def bag(path, said, ros=2):
     """A bag; `seconds` of the stamps are relative to the start, as its maker takes them."""
-    make = test_ros_bags.Maker(ros)
-    shift = test_ros_bags.START
+    make = Maker(ros)
+    shift = BAG_START
     writer = rosbag2.Writer(path, version=9) if ros == 2 else rosbag1.Writer(path)
     pack = make.store.serialize_cdr if ros == 2 else make.store.serialize_ros1
     types = {"odometry": ("/odom", ros_bags.ODOMETRY), "scan": ("/scan", ros_bags.SCAN)}

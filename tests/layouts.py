@@ -115,7 +115,7 @@ def bag(path, said, ros=2):
                 message = make.odometry(own - shift, data)
             else:
                 message = make.scan(
-                    own - shift, data, first=LIDAR.angle_min, step=LIDAR.angle_increment
+                    own - shift, data, first=LIDAR.angle_min, step=np.pi / len(data)
                 )
             content = pack(message, types[kind][1])
             writer.write(known[kind], int(round(1e9 * received)), content)

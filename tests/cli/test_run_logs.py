@@ -59,11 +59,25 @@ def test_a_reference_without_headings_is_refused_by_tune(tmp_path, capsys):
     assert "quaternions hold no heading" in refused(capsys, "tune", log, *options)
 
 
+def room_scan(pose, beams=180):
+    """Ranges of a half circle of beams in a room of 14 x 9 m."""
+    angle = pose[2] + np.pi * (np.arange(beams) / beams - 0.5)
+    x, y = np.cos(angle), np.sin(angle)
+    east_west = np.where(x > 0, 10.0 - pose[0], 4.0 + pose[0]) / np.maximum(np.abs(x), 1e-9)
+    north_south = np.where(y > 0, 4.0 - pose[1], 5.0 + pose[1]) / np.maximum(np.abs(y), 1e-9)
+    return np.minimum(east_west, north_south)
+
+
 @pytest.mark.slow
 def test_poses_of_the_robot_and_notes(tmp_path, capsys):
     """Those of the scanner are the robot's, moved by the mount."""
     mount, log = np.array([0.3, -0.1, 0.5]), tmp_path / "a"
-    layouts.bag(log, layouts.messages())
+    poses = iter(layouts.true_poses())
+    said = [
+        m._replace(data=room_scan(next(poses))) if m.kind == "scan" else m
+        for m in layouts.messages()
+    ]
+    layouts.bag(log, said)
     found = {}
     for frame in ("scanner", "base"):
         out = tmp_path / frame

@@ -15,6 +15,8 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import noise_file, readers
 from jaxslam.io.errors import InputError
 
+MIN_BEAMS = 32  # of a scan, from which the front end works
+
 OptionalFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 """Option that names a file, or none."""
 
@@ -85,6 +87,13 @@ def require_odometry(path: Path, log: LaserLog) -> None:
     if not log.has_odometry:
         reason = next((note for note in log.notes if note.startswith("no odometry")), "no odometry")
         raise InputError(reason, path=path, advice="use --odometry scans-only")
+
+
+def require_beams(path: Path, log: LaserLog) -> None:
+    """Raise InputError if the scans of a log have too few beams to find walls in them."""
+    if log.lidar.num_beams < MIN_BEAMS:
+        problem = f"has {log.lidar.num_beams} beams a scan, of which {MIN_BEAMS} are needed"
+        raise InputError(problem, path=path, advice="name a log of a laser scanner")
 
 
 def check_range(option: str, value: float, low: float, high: float) -> None:

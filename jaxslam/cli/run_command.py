@@ -19,6 +19,7 @@ from jaxslam.cli.options import (
     check_range,
     name_errors,
     read_params,
+    require_beams,
     require_odometry,
     stopwatch,
 )
@@ -91,6 +92,7 @@ def run(
         out: Folder for the results.
     """
     laser_log = scanner.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
+    require_beams(log, laser_log)
     if odometry == "wheels":
         require_odometry(log, laser_log)
     known, notes = None, list(laser_log.notes)

@@ -19,8 +19,14 @@ def refused(capsys, *arguments):
 
 def still(path):
     """A log whose wheels never turn."""
-    said = [m for m in layouts.messages() if m.kind == "scan"]
-    return layouts.carmen(path, said)
+    scan = f"FLASER 40 {'2.5 ' * 40}1 2 0.5 1 2 0.5"
+    path.write_text("".join(f"{scan} {t} host {t}\n" for t in range(60)))
+    return path
+
+
+def test_run_refuses_scans_of_a_few_beams(tmp_path, capsys):
+    log = layouts.carmen(tmp_path / "a.clf", layouts.messages())
+    assert "has 8 beams a scan, of which 32 are needed" in refused(capsys, "run", log)
 
 
 @pytest.mark.parametrize("command", ["run", "tune"])

@@ -41,6 +41,8 @@ def map_occupancy(
     grid = ros_map.read(map_file)
     rows, columns = grid.free.shape
     print(f"{map_file}: {rows} x {columns} cells of {grid.resolution:g} m", flush=True)
+    for note in grid.notes:
+        print(f"note: {note}", flush=True)
     stages = (*grid_topology.STAGES, "writing")
     with (
         folder(out) as out_dir,

@@ -14,25 +14,29 @@ from jaxslam.cli.options import (
     OptionalFile,
     OptionalTopic,
     OutFolder,
+    Scanner,
+    ScannerOptions,
     check_range,
     name_errors,
     read_params,
+    require_beams,
+    require_odometry,
     stopwatch,
 )
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
+from jaxslam.core.se2_np import compose, relative
 from jaxslam.core.se2_np import increments as increments_of
-from jaxslam.core.se2_np import relative
 from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
-from jaxslam.io import readers, tum
 from jaxslam.io import relations as relations_file
+from jaxslam.io import tum
 from jaxslam.io.output import folder
 from jaxslam.pipeline import arguments, offline
 from jaxslam.pipeline.config import Config
@@ -50,6 +54,8 @@ def run(
     noise: OptionalFile = None,
     scan_topic: OptionalTopic = None,
     odometry_topic: OptionalTopic = None,
+    scanner: Scanner = ScannerOptions(),  # noqa: B008
+    pose_frame: Literal["scanner", "base"] = "scanner",
     scan: OptionalCount = None,
     gif: bool = False,
     rerun: Annotated[
@@ -66,8 +72,8 @@ def run(
     the first scan is the origin of the map.
 
     Args:
-        log: CARMEN log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is the log
-            that the extra [data] installs.
+        log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is
+            the log that the extra [data] installs.
         reference: Reference trajectory to evaluate with: a TUM file with the log's clock.
         relations: Verified relative poses to evaluate with, with the log's clock.
         odometry: Scan matching fused with wheel odometry (scan), or wheel odometry alone (wheels).
@@ -77,14 +83,22 @@ def run(
         scan_topic: Topic of the laser scans in a bag; by default the one with most messages.
         odometry_topic: Topic of the odometry or of the transforms in a bag; by default the one
             with most messages.
+        scanner: The scanner and the frames of the log.
+        pose_frame: Whose poses trajectory.tum holds: those of the scanner, or of the robot (base).
         scan: Number of a scan, from 0, whose local Voronoi diagram is drawn: scan.png.
         gif: Write an animation of the run: run.gif.
         rerun: Show the run in the rerun viewer while it is processed (live), or write run.rrd for
             it (file); needs the extra [view].
         out: Folder for the results.
     """
-    laser_log = readers.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
-    known = None if reference is None else tum.read(reference)
+    laser_log = scanner.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
+    require_beams(log, laser_log)
+    if odometry == "wheels":
+        require_odometry(log, laser_log)
+    known, notes = None, list(laser_log.notes)
+    if reference is not None:
+        known, more = tum.read_reference(reference)
+        notes += [f"{reference}: {note}" for note in more]
     verified = None if relations is None else relations_file.read(relations)
     match_scans = odometry == "scan"
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
@@ -122,7 +136,7 @@ def run(
         numbers = {
             "scans": len(result.poses),
             "skipped_lines": laser_log.num_skipped,
-            "mended": laser_log.odometry_repairs,
+            "mended": notes,
             "odometry": odometry,
             "path_length_m": log_errors.path_length(result.poses if match_scans else odom_poses),
             "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
@@ -134,6 +148,10 @@ def run(
         if dead_reckoning:
             numbers["dead_reckoning"] = dead_reckoning
         report.write_results(out_dir, numbers, laser_log.times, result)
+        if pose_frame == "base":
+            base = relative(laser_log.mount, np.zeros(3))  # the robot in the frame of the scanner
+            base_poses = compose(np.asarray(result.poses, np.float64), base)
+            tum.write(out_dir / "trajectory.tum", laser_log.times, base_poses)
         measurements = Measurement(
             jnp.asarray(increments, float), result.features, scan_match=result.scan_matches
         )
@@ -146,7 +164,8 @@ def run(
             trajectories["reference"] = log_errors.reference_in_map(
                 laser_log.times, result.poses, known
             )
-            error = _online_errors(laser_log, result, known)
+            if log_errors.has_heading(known):
+                error = _online_errors(laser_log, result, known)
         report.draw(out_dir, config, result, trajectories, error, scans=scans)
         if scan is not None:
             report.draw_scan(out_dir / "scan.png", config, scans, scan)
@@ -169,7 +188,7 @@ def _errors(
 ) -> Metrics:
     """Errors of the trajectory, and of the filter if it was smoothed; none without a reference."""
     numbers: Metrics = {}
-    if reference is not None:
+    if reference is not None and log_errors.has_heading(reference):
         error, cov = _online_errors(laser_log, result, reference), np.asarray(result.info.pose_cov)
         numbers["nees"] = log_errors.mean_nees_per_dof(error, cov)
     if reference is not None or relations is not None:

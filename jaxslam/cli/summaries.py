@@ -26,8 +26,8 @@ def print_summary(numbers: Metrics, title: str, out: Path) -> None:
     print(f"\n{title}; path length {numbers['path_length_m']:.0f} m")
     if numbers.get("skipped_lines"):
         print(f"{numbers['skipped_lines']} broken lines, or scans without odometry, skipped")
-    for repair in numbers.get("mended", ()):
-        print(f"odometry repairs: {repair}")
+    for note in numbers.get("mended", ()):
+        print(f"note: {note}")
     odometry = numbers.get("dead_reckoning", {})
     if odometry:
         print(f"{'':36}{'SLAM':>10}{'odometry':>10}{'ratio':>8}")

@@ -17,6 +17,8 @@ from jaxslam.cli.options import (
     OptionalCount,
     OptionalFile,
     OutFolder,
+    Scanner,
+    ScannerOptions,
     check_range,
     name_errors,
     stopwatch,
@@ -69,6 +71,7 @@ def tune(
         tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
     ] = (),
     noise: OptionalFile = None,
+    scanner: Scanner = ScannerOptions(),  # noqa: B008
     seed: int = 0,
     out: OutFolder = Path("out"),
 ) -> None:
@@ -105,6 +108,7 @@ def tune(
             odometry_coefficients[3], range_std, bearing_std, feature_std_scale, wall_angle_std,
             scan_match_std_scale.
         noise: File of the initial noise parameters (Q and R); by default cautious ones.
+        scanner: The scanner and the frames of laser logs.
         seed: Random seed of the simulation and of the order of the minibatches.
         out: Folder for the results.
     """
@@ -122,7 +126,13 @@ def tune(
     if logs:
         match_scans = odometry == "scan"
         task = recorded_task(
-            logs, test, reference, noise, match_scans=match_scans, loss=settings.loss
+            logs,
+            test,
+            reference,
+            noise,
+            match_scans=match_scans,
+            loss=settings.loss,
+            scanner=scanner,
         )
     else:
         if test or reference:

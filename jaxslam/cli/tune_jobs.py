@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli.options import name_errors, read_params
+from jaxslam.cli.options import ScannerOptions, name_errors, read_params, require_odometry
 from jaxslam.core import time_series
 from jaxslam.core.episode import Episode
 from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.io import mrclam, readers, tum
+from jaxslam.io import mrclam, tum
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
@@ -120,6 +120,7 @@ def recorded_task(
     *,
     match_scans: bool,
     loss: Loss,
+    scanner: ScannerOptions = ScannerOptions(),  # noqa: B008
 ) -> TuneTask:
     """Read and check all files of a tuning on logs."""
     robots = {path: mrclam_robots(path) for path in (*logs, *test)}
@@ -134,7 +135,9 @@ def recorded_task(
             noise,
         )
     else:
-        files = _read_laser_logs(logs, test, reference, noise, match_scans=match_scans)
+        files = _read_laser_logs(
+            logs, test, reference, noise, match_scans=match_scans, scanner=scanner
+        )
     if losses.needs_truth(loss) and files.no_reference:
         problem = f"has no reference, which the loss {losses.name_of(loss)} needs"
         raise InputError(problem, path=files.no_reference[0], advice=files.advice)
@@ -200,15 +203,21 @@ def _read_laser_logs(
     noise: Path | None,
     *,
     match_scans: bool,
+    scanner: ScannerOptions,
 ) -> _LogFiles:
     """Read laser logs of one scanner with their reference trajectories, if there are any."""
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     paths = [*train, *test]
-    logs = [readers.read_log(path) for path in paths]
+    logs = [scanner.read_log(path) for path in paths]
+    for path, log in zip(paths, logs, strict=True):
+        if not match_scans:
+            require_odometry(path, log)
+        for note in log.notes:
+            print(f"{path}: note: {note}", flush=True)
     if reference and len(reference) != len(logs):
         problem = f"{len(reference)} files for {len(logs)} logs"
         raise InputError(problem, field="--reference", advice="give one for each log, in order")
-    references: list[Trajectory | None] = [tum.read(path) for path in reference]
+    references: list[Trajectory | None] = [_read_reference(path) for path in reference]
     for path, log in zip(paths, logs, strict=True):
         if log.lidar != logs[0].lidar:
             problem = f"has another scanner than {paths[0]}"
@@ -235,6 +244,15 @@ def _read_laser_logs(
         [] if reference else train,
         "give --reference, or use --loss innovation_nll",
     )
+
+
+def _read_reference(path: Path) -> Trajectory:
+    """A reference trajectory, which must have headings."""
+    trajectory, notes = tum.read_reference(path)
+    if notes:
+        advice = "give one with headings; the losses compare poses"
+        raise InputError(notes[0], path=path, advice=advice)
+    return trajectory
 
 
 def mrclam_robots(path: Path) -> list[tuple[Path, int]] | None:

@@ -32,7 +32,12 @@ class LaserLog(NamedTuple):
         odom_stream_poses: (N, 3) float64 [m, m, rad] of the odometry stream; those of the scans if
             the log has no separate stream.
         source: Topics that were read, for messages; "" where there is no choice.
-        odometry_repairs: What was wrong with the odometry and has been corrected.
+        notes: What was wrong with the log and has been corrected, or had to be assumed.
+        has_odometry: Whether there is odometry at all; if not, its poses stand still.
+        odometry_stale: (T,) bool, whether the increment of the odometry to a scan is not to be
+            trusted: it was late, lost or interpolated; None if all are to be.
+        mount: (3,) [m, m, rad] pose of the scanner in the robot frame (`base_link`), as far as it
+            is known; the identity if not.
     """
 
     times: np.ndarray
@@ -43,7 +48,10 @@ class LaserLog(NamedTuple):
     odom_stream_times: np.ndarray
     odom_stream_poses: np.ndarray
     source: str = ""
-    odometry_repairs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    has_odometry: bool = True
+    odometry_stale: np.ndarray | None = None
+    mount: np.ndarray = np.zeros(3)
 
     @classmethod
     def from_arrays(
@@ -94,6 +102,7 @@ class LaserLog(NamedTuple):
             num_skipped=0,
             odom_stream_times=odom_stream_times,
             odom_stream_poses=odom_stream_poses,
+            odometry_stale=np.zeros(times.size, bool),
         )
 
 

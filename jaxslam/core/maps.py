@@ -17,12 +17,14 @@ class OccupancyMap(NamedTuple):
         free: (H, W) bool.
         resolution: [m] side of a cell.
         origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
+        notes: What is not as the file of the map has it.
     """
 
     occupied: np.ndarray
     free: np.ndarray
     resolution: float
     origin: np.ndarray
+    notes: tuple[str, ...] = ()
 
 
 class TopologicalMap(NamedTuple):

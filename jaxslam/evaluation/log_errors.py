@@ -10,13 +10,21 @@ from jaxslam.evaluation import consistency, trajectory
 from jaxslam.evaluation.summary import Metrics as Metrics
 from jaxslam.pipeline.episodes import TrialResult
 
+NEED_HEADING = ("rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "heading_rmse_deg")
+"""Keys of errors that a reference without headings cannot give."""
+
 Trajectory = tuple[np.ndarray, np.ndarray]
-"""Times (N,) [s] and poses (N, 3) [m, m, rad]."""
+"""Times (N,) [s] and poses (N, 3) [m, m, rad]; headings are NaN if there are none."""
 
 
 def pose_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Errors (..., 3) [m, m, rad] of poses (..., 3), world frame."""
     return np.asarray(consistency.pose_error(jnp.asarray(poses, float), jnp.asarray(truth, float)))
+
+
+def has_heading(reference: Trajectory) -> bool:
+    """Whether a reference has headings to compare with."""
+    return bool(np.isfinite(reference[1][:, 2]).all())
 
 
 def path_length(poses: np.ndarray) -> float:
@@ -36,9 +44,14 @@ def mean_ate(results: TrialResult) -> float | None:
 
 
 def against_reference(times: np.ndarray, poses: np.ndarray, reference: Trajectory) -> Metrics:
-    """ATE, RPE and heading RMSE of poses (T, 3), after rigid alignment with a reference."""
+    """ATE, RPE and heading RMSE of poses (T, 3), after rigid alignment with a reference.
+
+    RPE and heading are None for a reference without headings.
+    """
     ref_times, ref_poses = reference
     ate = trajectory.ate(times, poses, ref_times, ref_poses)
+    if not has_heading(reference):
+        return ate | dict.fromkeys(NEED_HEADING)
     rpe = trajectory.rpe(times, poses, ref_times, ref_poses)
     i, j = time_series.match_times(times, ref_times).T
     frame = trajectory.align_trajectory(poses[i, :2], ref_poses[j, :2])

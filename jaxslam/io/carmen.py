@@ -2,16 +2,15 @@
 
     ODOM x y theta tv rv accel ipc_time host logger_time
     FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_time host logger_time
-    ROBOTLASER1 ... (`robotlaser`)
+    ROBOTLASER1, RAWLASER1 ... (`robotlaser`)
+    PARAM name value ...
 
-All other messages and comments are ignored, and so is ROBOTLASER1 in a log with FLASER, where both
-hold the same scans. Poses of ROBOTLASER1 are those of the laser. Where the odometry restarts, or
-the poses of the scans were corrected by another program, the odometry is rebuilt from the ODOM
-lines, and `LaserLog.odometry_repairs` says so.
+Scans are those of FLASER or, without these, of ROBOTLASER1 or of RAWLASER1: a log often holds the
+same scans twice. FLASER lines may also end after the readings, or hold no poses. PARAM lines may
+say where the front laser sits on the robot. All other messages and comments are ignored.
 """
 
 import math
-from collections import Counter
 from os import PathLike
 
 import numpy as np
@@ -21,27 +20,29 @@ from jaxslam.core.logs import (
     DEFAULT_RANGE_STD,
     MAX_BROKEN_FRACTION,
     LaserLog,
-    mark_no_return,
 )
 from jaxslam.core.scan import Lidar
-from jaxslam.core.time_series import interpolate_poses, sort_by_time
 from jaxslam.io import robotlaser
-from jaxslam.io.errors import InputError, check_range_max
-from jaxslam.io.odometry_repair import poses_are_corrected, remove_jumps
-from jaxslam.io.robotlaser import RobotLaser
+from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.errors import InputError
+from jaxslam.io.raw_log import RawLog, RawScan, RawTransform, as_odometry
 from jaxslam.io.text import lines, number
 
 _FORMS = {
     b"ODOM": "ODOM x y theta tv rv accel ipc_time host logger_time",
     b"ROBOTLASER1": robotlaser.FORM,
+    b"RAWLASER1": robotlaser.RAW_FORM,
     b"FLASER": "FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_time host logger_time",
 }
+SCAN_KEYWORDS = (b"FLASER", b"ROBOTLASER1", b"RAWLASER1")  # the first that occurs is read
+_MOUNT_PARAMS = ("robot_frontlaser", "robot_front_laser", "laser_front_laser")  # + _offset ...
+LASER_FRAME, BASE_FRAME = "front_laser", "base_link"
 
-_StampedPose = tuple[float, float, float, float]
-"""Time [s] and pose [m, m, rad]."""
+_Pose = tuple[float, float, float]
+"""Pose [m, m, rad]."""
 
-_FlaserScan = tuple[int, _StampedPose, np.ndarray]
-"""Line number, time and odometry pose, ranges (R,) [m] of a FLASER line."""
+_Scan = tuple[RawScan, _Pose | None]
+"""A scan and its pose by odometry; None if the line has none."""
 
 _Broken = dict[int, tuple[bytes, str]]
 """Keyword of each broken line and what is wrong with it, by line number."""
@@ -56,73 +57,101 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
 
     Raises:
         InputError: `range_max` is not positive, the file cannot be read or is no CARMEN log, more
-            than 5 % of its ODOM and FLASER lines are broken, there is no scan, or its odometry
-            never changes.
+            than 5 % of its lines of scans and odometry are broken, or there is no scan.
     """
-    check_range_max(range_max)
-    odometry: list[_StampedPose] = []
-    flaser: list[_FlaserScan] = []
-    robotlaser1: dict[int, RobotLaser] = {}
+    options = LogOptions(range_max=range_max)
+    check_options(options)
+    return assemble(path, read_raw(path), options)
+
+
+def read_raw(path: str | PathLike) -> RawLog:
+    """Scans, odometry and mount of a log.
+
+    Raises:
+        InputError: The file cannot be read or is no CARMEN log, more than 5 % of its lines of
+            scans and odometry are broken, or there is no scan.
+    """
+    odometry: list[tuple[float, float, int, float, float, float]] = []
+    scans: dict[bytes, list[_Scan]] = {keyword: [] for keyword in SCAN_KEYWORDS}
+    params: dict[str, float] = {}
     broken: _Broken = {}
     for line, text in lines(path):
         fields = text.split()
         keyword = fields[0] if fields else b""
         try:
             if keyword == b"ODOM":
-                odometry.append(_parse_odom(fields))
+                odometry.append(_parse_odom(line, fields))
             elif keyword == b"FLASER":
-                flaser.append((line, *_parse_flaser(fields)))
-            elif keyword == b"ROBOTLASER1":
-                robotlaser1[line] = robotlaser.parse(line, fields)
+                scans[keyword].append(_parse_flaser(line, fields))
+            elif keyword in scans:
+                scans[keyword].append(_parse_robotlaser(line, fields))
+            elif keyword == b"PARAM":
+                _parse_param(fields, params)
         except InputError as error:
             broken[line] = keyword, str(error)
-    use_robotlaser1 = bool(robotlaser1) and not flaser
-    unused = b"FLASER" if use_robotlaser1 else b"ROBOTLASER1"
-    broken = {line: problem for line, problem in broken.items() if problem[0] != unused}
-    if use_robotlaser1:
-        robotlaser1, other_scanner = robotlaser.same_scanner(robotlaser1)
-        broken |= {line: (b"ROBOTLASER1", problem) for line, problem in other_scanner.items()}
-        _check_broken(path, broken, len(odometry) + len(robotlaser1) + len(broken))
-        return _from_robotlaser1(path, odometry, list(robotlaser1.values()), len(broken), range_max)
-    if not odometry and not flaser and not broken:
+    used = next((keyword for keyword in SCAN_KEYWORDS if scans[keyword]), b"FLASER")
+    broken = {line: problem for line, problem in broken.items() if problem[0] in (used, b"ODOM")}
+    if not odometry and not scans[used] and not broken:
         advice = "name a CARMEN log; other formats have other readers"
         raise InputError("has neither FLASER nor ODOM lines", path=path, advice=advice)
-    total = len(odometry) + len(flaser) + len(broken)
-    flaser, other_count = _with_usual_beam_count(flaser)
-    broken |= other_count
+    chosen, without_poses = _with_poses(scans[used])
+    broken |= without_poses
+    total = len(odometry) + len(chosen) + len(broken)
     _check_broken(path, broken, total)
-    if not flaser:
+    if not chosen:
         problem = f"has no usable FLASER line among its {total} FLASER and ODOM lines"
         raise InputError(problem, path=path, advice="name a log that holds laser scans")
-    return _from_flaser(path, odometry, flaser, len(broken), range_max)
+    poses = [pose for _, pose in chosen if pose is not None]
+    return RawLog(
+        scans=[scan for scan, _ in chosen],
+        odometry=as_odometry(odometry),
+        base_frame=LASER_FRAME if used == b"ROBOTLASER1" else BASE_FRAME,
+        scan_poses=np.array(poses) if poses else None,
+        transforms=_mount_transform(params) if used == b"FLASER" else {},
+        num_skipped=len(broken),
+        poses_may_be_corrected=True,
+    )
 
 
-def _parse_odom(fields: list[bytes]) -> _StampedPose:
-    """Time and pose of an ODOM line; errors carry no line number."""
+def _parse_odom(line: int, fields: list[bytes]) -> tuple[float, float, int, float, float, float]:
+    """Stamp, time of logging, line and pose of an ODOM line; errors carry no line number."""
     if len(fields) != 10:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of 10")
     time = number(fields[7], "field 8 (ipc_time)")
     x, y = number(fields[1], "field 2 (x)"), number(fields[2], "field 3 (y)")
-    return time, x, y, number(fields[3], "field 4 (theta)")
+    theta = number(fields[3], "field 4 (theta)")
+    return time, robotlaser.logger_time(fields), line, x, y, theta
 
 
-def _parse_flaser(fields: list[bytes]) -> tuple[_StampedPose, np.ndarray]:
-    """Time and odometry pose of a FLASER line, and its ranges (n,) [m]; errors as above."""
+def _parse_flaser(line: int, fields: list[bytes]) -> _Scan:
+    """Scan and odometry pose of a FLASER line; errors carry no line number."""
     count = number(fields[1], "field 2 (n)") if len(fields) > 1 else 0.0
     if count < 2 or count != int(count):
         raise InputError(f"{count:g} is not a beam count", field="field 2 (n)")
     num_beams = int(count)
     num_other = len(fields) - 2 - num_beams
-    if num_other in (0, 3):
-        raise InputError("no odometry: the fields x y theta odom_x odom_y odom_theta are missing")
-    if num_other != 9:
+    if num_other not in (0, 3, 9):
         raise InputError(f"cut or damaged: {len(fields)} fields instead of {num_beams + 11}")
-    names = {8: "ipc_time", 5: "odom_x", 6: "odom_y", 7: "odom_theta"}
-    time, x, y, theta = (
-        number(fields[num_beams + i], f"field {num_beams + i + 1} ({name})")
-        for i, name in names.items()
-    )
-    return (time, x, y, theta), _parse_ranges(fields[2 : 2 + num_beams])
+    pose, time = None, math.nan
+    if num_other == 9:
+        names = {5: "odom_x", 6: "odom_y", 7: "odom_theta"}
+        x, y, theta = (
+            number(fields[num_beams + i], f"field {num_beams + i + 1} ({name})")
+            for i, name in names.items()
+        )
+        pose = x, y, theta
+    if num_other:
+        time = number(fields[-3], f"field {len(fields) - 2} (ipc_time)")
+    received = robotlaser.logger_time(fields) if num_other else math.nan
+    ranges = _parse_ranges(fields[2 : 2 + num_beams])
+    lidar = half_circle_lidar(num_beams, DEFAULT_RANGE_MAX)
+    geometry = lidar.angle_min, lidar.angle_increment
+    return RawScan(time, received, line, LASER_FRAME, *geometry, math.inf, ranges), pose
+
+
+def _parse_robotlaser(line: int, fields: list[bytes]) -> _Scan:
+    """Scan and odometry pose of a ROBOTLASER1 or RAWLASER1 line; errors carry no line number."""
+    return robotlaser.parse(line, fields, LASER_FRAME)
 
 
 def _parse_ranges(fields: list[bytes]) -> np.ndarray:
@@ -138,17 +167,36 @@ def _parse_ranges(fields: list[bytes]) -> np.ndarray:
     return ranges
 
 
-def _with_usual_beam_count(scans: list[_FlaserScan]) -> tuple[list[_FlaserScan], _Broken]:
-    """Scans with the most frequent beam count, and the others as broken lines."""
-    if not scans:
-        return scans, {}
-    usual = Counter(ranges.size for _, _, ranges in scans).most_common(1)[0][0]
-    others = {
-        line: (b"FLASER", f"field 2 (n): beam count changes: {ranges.size} instead of {usual}")
-        for line, _, ranges in scans
-        if ranges.size != usual
-    }
-    return [scan for scan in scans if scan[0] not in others], others
+def _parse_param(fields: list[bytes], params: dict[str, float]) -> None:
+    """Add a parameter whose value is a number; others are not needed."""
+    try:
+        value = float(fields[2])
+    except (ValueError, IndexError):
+        return
+    if math.isfinite(value):
+        params[fields[1].decode("utf-8", "replace")] = value
+
+
+def _mount_transform(params: dict[str, float]) -> dict[tuple[str, str], RawTransform]:
+    """Transform from the robot to its front laser, if there are parameters for it."""
+    for prefix in _MOUNT_PARAMS:
+        names = [f"{prefix}_{name}" for name in ("offset", "side_offset", "angular_offset")]
+        if names[0] in params:
+            x, y, yaw = (params.get(name, 0.0) for name in names)
+            values = (x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+            transform = RawTransform(BASE_FRAME, LASER_FRAME, [(0.0, math.nan, 0)], [values])
+            return {(BASE_FRAME, LASER_FRAME): transform}
+    return {}
+
+
+def _with_poses(scans: list[_Scan]) -> tuple[list[_Scan], _Broken]:
+    """Scans that have poses, and the others as broken lines; all scans if most have none."""
+    without = [scan for scan, pose in scans if pose is None]
+    if 2 * len(without) > len(scans):
+        return [(scan, None) for scan, _ in scans], {}
+    reason = "no odometry: the fields x y theta odom_x odom_y odom_theta are missing"
+    broken = {scan.order: (b"FLASER", reason) for scan in without}
+    return [(scan, pose) for scan, pose in scans if pose is not None], broken
 
 
 def _check_broken(path: str | PathLike, broken: _Broken, total: int) -> None:
@@ -160,90 +208,6 @@ def _check_broken(path: str | PathLike, broken: _Broken, total: int) -> None:
     problem = f"{reason} ({len(broken)} of {total} lines of scans and odometry are broken)"
     advice = f"repair them, each is: {_FORMS[keyword]}"
     raise InputError(problem, path=path, line=line, advice=advice)
-
-
-def _from_flaser(
-    path: str | PathLike,
-    odometry: list[_StampedPose],
-    scans: list[_FlaserScan],
-    skipped: int,
-    range_max: float,
-) -> LaserLog:
-    """The log of FLASER lines."""
-    stamped_poses = np.array([stamped_pose for _, stamped_pose, _ in scans])
-    ranges = mark_no_return(np.array([ranges for _, _, ranges in scans]), range_max)
-    lidar = half_circle_lidar(ranges.shape[1], range_max)
-    return _build_log(path, odometry, stamped_poses, ranges, lidar, skipped)
-
-
-def _from_robotlaser1(
-    path: str | PathLike,
-    odometry: list[_StampedPose],
-    scans: list[RobotLaser],
-    skipped: int,
-    range_max: float,
-) -> LaserLog:
-    """The log of ROBOTLASER1 lines."""
-    stamped_poses = np.array([(scan.time, *scan.pose) for scan in scans])
-    first = scans[0]
-    range_max = min(range_max, first.range_max)
-    ranges = mark_no_return(np.array([scan.ranges for scan in scans]), range_max)
-    lidar = Lidar(
-        ranges.shape[1], first.angle_min, first.angle_increment, range_max, DEFAULT_RANGE_STD
-    )
-    return _build_log(path, odometry, stamped_poses, ranges, lidar, skipped)
-
-
-def _build_log(
-    path: str | PathLike,
-    odometry: list[_StampedPose],
-    stamped_poses: np.ndarray,
-    ranges: np.ndarray,
-    lidar: Lidar,
-    skipped: int,
-) -> LaserLog:
-    """Combine scans and odometry, and repair the odometry where it restarts or was corrected.
-
-    Args:
-        path: The log, for errors.
-        odometry: Times and poses of the ODOM lines.
-        stamped_poses: (T, 4) times [s] and poses [m, m, rad] of the scans.
-        ranges: (T, R) float32 [m].
-        lidar: The scanner.
-        skipped: Number of broken lines.
-    """
-    if len(stamped_poses) > 1 and not np.ptp(stamped_poses[:, 1:], axis=0).any():
-        problem = f"no odometry: its pose is the same in all {len(stamped_poses)} scans"
-        raise InputError(problem, path=path, advice="name a log with wheel odometry")
-    stream = np.array(odometry) if odometry else stamped_poses  # (N, 4)
-    times, odom_times = stamped_poses[:, 0].copy(), stream[:, 0].copy()
-    corrected = bool(odometry) and poses_are_corrected(
-        times, stamped_poses[:, 1:], odom_times, stream[:, 1:]
-    )
-    odom_poses, restarts = remove_jumps(odom_times, stream[:, 1:].copy())
-    if restarts > MAX_BROKEN_FRACTION * len(stream):
-        problem = f"its odometry jumps {restarts} times in {len(stream)} lines"
-        raise InputError(problem, path=path, advice="name a log with wheel odometry")
-    repairs = []
-    if restarts:
-        repairs.append(f"odometry restarts ({restarts} x): no motion is assumed there")
-    if corrected:
-        repairs.append("poses of the scans are not odometry: ODOM lines are used instead")
-    scan_poses = stamped_poses[:, 1:].copy()
-    if odometry and repairs:
-        scan_poses = interpolate_poses(times, *sort_by_time(odom_times, odom_poses))
-    elif not odometry:
-        scan_poses = odom_poses.copy()
-    return LaserLog(
-        times=times,
-        odom_poses=scan_poses,
-        ranges=ranges,
-        lidar=lidar,
-        num_skipped=skipped,
-        odom_stream_times=odom_times,
-        odom_stream_poses=odom_poses,
-        odometry_repairs=tuple(repairs),
-    )
 
 
 def half_circle_lidar(num_beams: int, range_max: float) -> Lidar:

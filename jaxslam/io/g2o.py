@@ -13,19 +13,15 @@ from os import PathLike
 
 import numpy as np
 
-from jaxslam.core.logs import (
-    DEFAULT_RANGE_MAX,
-    DEFAULT_RANGE_STD,
-    MAX_BROKEN_FRACTION,
-    LaserLog,
-    mark_no_return,
-)
-from jaxslam.core.scan import Lidar
+from jaxslam.core.logs import DEFAULT_RANGE_MAX, MAX_BROKEN_FRACTION, LaserLog
 from jaxslam.core.se2_np import dead_reckoning
 from jaxslam.io import robotlaser
-from jaxslam.io.errors import InputError, check_range_max
-from jaxslam.io.robotlaser import RobotLaser
+from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.errors import InputError
+from jaxslam.io.raw_log import RawLog, RawScan, as_odometry
 from jaxslam.io.text import lines, number
+
+FRAME = "laser"  # of the scans, whose poses the odometry is
 
 _FORMS = {
     b"VERTEX_SE2": "VERTEX_SE2 id x y theta",
@@ -46,9 +42,20 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
         InputError: `range_max` is not positive, the file cannot be read, has no scan or no odometry
             from one vertex to the next, a vertex or edge is broken, or more than 5 % of the scans.
     """
-    check_range_max(range_max)
+    options = LogOptions(range_max=range_max)
+    check_options(options)
+    return assemble(path, read_raw(path), options)
+
+
+def read_raw(path: str | PathLike) -> RawLog:
+    """Scans of a pose graph, with their poses by its odometry edges.
+
+    Raises:
+        InputError: The file cannot be read, has no scan or no odometry from one vertex to the next,
+            a vertex or edge is broken, or more than 5 % of the scans.
+    """
     vertices: list[int] = []  # ids in file order
-    scans: dict[int, RobotLaser] = {}
+    scans: dict[int, RawScan] = {}
     edges: dict[tuple[int, int], tuple[float, ...]] = {}
     broken: dict[int, str] = {}
     for line, text in lines(path):
@@ -63,7 +70,7 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
                 pair = _vertex_id(fields, 12, 1), _vertex_id(fields, 12, 2)
                 edges.setdefault(pair, tuple(number(field, "x y theta") for field in fields[3:6]))
             elif vertices:
-                scans.setdefault(vertices[-1], robotlaser.parse(line, fields))
+                scans.setdefault(vertices[-1], robotlaser.parse(line, fields, FRAME)[0])
         except InputError as error:
             if keyword != b"ROBOTLASER1":
                 advice = f"repair it, it is: {_FORMS[keyword]}"
@@ -75,10 +82,16 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
     if len(set(vertices)) < len(vertices):
         duplicate = Counter(vertices).most_common(1)[0][0]
         raise InputError(f"vertex {duplicate} occurs twice", path=path, advice="renumber them")
-    scans, other_scanner = robotlaser.same_scanner(scans)
-    broken |= other_scanner
     _check_scans(path, scans, broken)
-    return _build_log(path, vertices, scans, edges, len(broken), range_max)
+    poses = _odometry(path, vertices, edges)
+    has_scan = np.array([vertex in scans for vertex in vertices])
+    return RawLog(
+        scans=[scans[vertex] for vertex in vertices if vertex in scans],
+        odometry=as_odometry([]),
+        base_frame=FRAME,
+        scan_poses=poses[has_scan],
+        num_skipped=len(broken),
+    )
 
 
 def _vertex_id(fields: list[bytes], count: int, index: int) -> int:
@@ -91,9 +104,7 @@ def _vertex_id(fields: list[bytes], count: int, index: int) -> int:
     return int(value)
 
 
-def _check_scans(
-    path: str | PathLike, scans: dict[int, RobotLaser], broken: dict[int, str]
-) -> None:
+def _check_scans(path: str | PathLike, scans: dict[int, RawScan], broken: dict[int, str]) -> None:
     """Raise if there are no scans, or more are broken than `MAX_BROKEN_FRACTION` allows."""
     total = len(scans) + len(broken)
     if not total:
@@ -106,37 +117,16 @@ def _check_scans(
         raise InputError(problem, path=path, line=line, advice=advice)
 
 
-def _build_log(
+def _odometry(
     path: str | PathLike,
     vertices: list[int],
-    scans: dict[int, RobotLaser],
     edges: dict[tuple[int, int], tuple[float, ...]],
-    skipped: int,
-    range_max: float,
-) -> LaserLog:
-    """Poses by dead reckoning along the odometry edges, and keep those of vertices with a scan."""
+) -> np.ndarray:
+    """Poses (V, 3) [m, m, rad] of the vertices by dead reckoning along the odometry edges."""
     pairs = list(zip(vertices[:-1], vertices[1:], strict=True))
     for pair in pairs:
         if pair not in edges:
             problem = f"no EDGE_SE2 from vertex {pair[0]} to the next, {pair[1]}"
             raise InputError(problem, path=path, advice="name a graph with its odometry")
     increments = np.array([(0.0, 0.0, 0.0), *(edges[pair] for pair in pairs)])
-    poses = dead_reckoning(np.zeros(3), increments)
-    has_scan = np.array([vertex in scans for vertex in vertices])
-    kept = [scans[vertex] for vertex in vertices if vertex in scans]
-    first = kept[0]
-    range_max = min(range_max, first.range_max)
-    ranges = mark_no_return(np.array([scan.ranges for scan in kept]), range_max)
-    times = np.array([scan.time for scan in kept])
-    scan_poses = poses[has_scan]
-    return LaserLog(
-        times=times,
-        odom_poses=scan_poses,
-        ranges=ranges,
-        lidar=Lidar(
-            ranges.shape[1], first.angle_min, first.angle_increment, range_max, DEFAULT_RANGE_STD
-        ),
-        num_skipped=skipped,
-        odom_stream_times=times,
-        odom_stream_poses=scan_poses,
-    )
+    return dead_reckoning(np.zeros(3), increments)

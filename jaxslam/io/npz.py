@@ -14,6 +14,9 @@
 | `noise` | () [m] | standard deviation of a range; optional |
 | `wheel_times` | (N,) [s] | times of the whole odometry stream; optional |
 | `wheel_poses` | (N, 3) [m, m, rad] | its poses; optional |
+| `mount` | (3,) [m, m, rad] | pose of the scanner on the robot; optional |
+
+The poses are those of the scanner.
 """
 
 import math
@@ -23,14 +26,16 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.core.logs import DEFAULT_RANGE_STD, LaserLog, mark_no_return
-from jaxslam.core.scan import Lidar
-from jaxslam.io.errors import InputError, check_range_max
+from jaxslam.core.logs import DEFAULT_RANGE_STD, LaserLog
+from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
+from jaxslam.io.raw_log import RawLog, RawOdometry, RawScan, Stamps, as_odometry
 
+FRAME = "laser"  # of the scans, whose poses the odometry is
 FORMAT, VERSION = "jaxslam-recording", 1
 _REQUIRED = ("format", "version", "times", "odometry", "ranges", "first", "step", "reach")
-_OPTIONAL = ("noise", "wheel_times", "wheel_poses")
+_OPTIONAL = ("noise", "wheel_times", "wheel_poses", "mount")
 _LIMITS = {"step": (1e-6, math.pi), "reach": (1e-3, 1e6), "noise": (1e-6, 1e3)}
 _ADVICE = f"it is a NumPy file with {', '.join(_REQUIRED)}"
 
@@ -46,6 +51,7 @@ def write(path: str | PathLike, log: LaserLog) -> None:
         ValueError: `LaserLog.from_arrays` refuses a field, or `read` would refuse the scanner.
         InputError: The file cannot be written.
     """
+    mount = log.mount
     log = LaserLog.from_arrays(
         log.times,
         log.odom_poses,
@@ -78,6 +84,7 @@ def write(path: str | PathLike, log: LaserLog) -> None:
             step=lidar.angle_increment,
             reach=lidar.range_max,
             noise=lidar.range_std,
+            mount=np.asarray(mount, np.float64),
         )
 
 
@@ -93,7 +100,18 @@ def read(path: str | PathLike, *, range_max: float = math.inf) -> LaserLog:
         InputError: `range_max` is not positive; or the file cannot be read, lacks an array, has an
             unknown one, or one of a wrong shape or with values out of range.
     """
-    check_range_max(range_max, infinite=True)
+    options = LogOptions(range_max=range_max)
+    check_options(options)
+    return assemble(path, read_raw(path), options)
+
+
+def read_raw(path: str | PathLike) -> RawLog:
+    """Scans and odometry of a log.
+
+    Raises:
+        InputError: The file cannot be read, lacks an array, has an unknown one, or one of a wrong
+            shape or with values out of range.
+    """
     arrays = _load(path)
     for name in sorted(arrays.keys() - {*_REQUIRED, *_OPTIONAL}):
         raise InputError("unknown array", path=path, field=name, advice=_ADVICE)
@@ -103,32 +121,25 @@ def read(path: str | PathLike, *, range_max: float = math.inf) -> LaserLog:
     if str(arrays["format"]) != FORMAT or str(arrays["version"]) != str(VERSION):
         problem = f"is {arrays['format']} {arrays['version']}, not {FORMAT} {VERSION}"
         raise InputError(problem, path=path, field="format", advice=_ADVICE)
-
     times = _array(path, arrays, "times", (None,))
     count = len(times)
-    odometry = _array(path, arrays, "odometry", (count, 3))
+    poses = _array(path, arrays, "odometry", (count, 3))
     ranges = _array(path, arrays, "ranges", (count, None), finite=False)
     if not count or ranges.shape[1] < 2:
         advice = "give one scan at least, of two beams at least"
         raise InputError(f"has the shape {ranges.shape}", path=path, field="ranges", advice=advice)
-    lidar = Lidar(
-        ranges.shape[1],
-        float(_array(path, arrays, "first", ())),
-        _number(path, arrays, "step"),
-        min(_number(path, arrays, "reach"), range_max),
-        _number(path, arrays, "noise") if "noise" in arrays else DEFAULT_RANGE_STD,
-    )
-    wheel_times, wheel_poses = times, odometry
-    if "wheel_times" in arrays or "wheel_poses" in arrays:
-        wheel_times, wheel_poses = _odometry_stream(path, arrays)
-    return LaserLog(
-        times=times,
-        odom_poses=odometry,
-        ranges=mark_no_return(ranges, lidar.range_max),
-        lidar=lidar,
-        num_skipped=0,
-        odom_stream_times=wheel_times,
-        odom_stream_poses=wheel_poses,
+    first = float(_array(path, arrays, "first", ()))
+    step, reach = _number(path, arrays, "step"), _number(path, arrays, "reach")
+    return RawLog(
+        scans=[
+            RawScan(time, math.nan, index, FRAME, first, step, reach, reading)
+            for index, (time, reading) in enumerate(zip(times.tolist(), ranges, strict=True))
+        ],
+        odometry=_odometry_stream(path, arrays, count),
+        base_frame=FRAME,
+        scan_poses=poses,
+        range_std=_number(path, arrays, "noise") if "noise" in arrays else DEFAULT_RANGE_STD,
+        mount=_array(path, arrays, "mount", (3,)) if "mount" in arrays else np.zeros(3),
     )
 
 
@@ -180,9 +191,11 @@ def _number(path: str | PathLike, arrays: Mapping[str, np.ndarray], name: str) -
 
 
 def _odometry_stream(
-    path: str | PathLike, arrays: Mapping[str, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) and poses (N, 3) of the odometry stream."""
+    path: str | PathLike, arrays: Mapping[str, np.ndarray], num_scans: int
+) -> RawOdometry:
+    """The odometry stream; empty if the file has none. Its order is that along the scans."""
+    if "wheel_times" not in arrays and "wheel_poses" not in arrays:
+        return as_odometry([])
     for name in ("wheel_times", "wheel_poses"):
         if name not in arrays:
             raise InputError("missing", path=path, field=name, advice="give both or neither")
@@ -191,4 +204,5 @@ def _odometry_stream(
     if len(times) != len(poses):
         problem = "has another length than wheel_times"
         raise InputError(problem, path=path, field="wheel_poses", advice=_ADVICE)
-    return times, poses
+    order = np.linspace(0.0, num_scans - 1.0, len(times))
+    return RawOdometry(Stamps(times, np.full(len(times), np.nan), order), poses)

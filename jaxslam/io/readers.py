@@ -1,6 +1,7 @@
 """Logs of any supported format, which is detected from the file."""
 
 import zipfile
+from collections.abc import Sequence
 from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
@@ -8,14 +9,16 @@ from types import ModuleType
 from typing import NamedTuple
 
 from jaxslam.core.logs import DEFAULT_RANGE_MAX, LaserLog
-from jaxslam.io import carmen, g2o, npz, ros_bags
-from jaxslam.io.errors import InputError, check_range_max
+from jaxslam.io import bag_files, carmen, g2o, npz, player, ros_bags
+from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.errors import InputError
+from jaxslam.io.raw_log import RawLog
 from jaxslam.io.text import lines
 
 MAX_LINES_SEARCHED = 1000  # lines among which there must be one of a known format
 
 _KEYWORDS = {b"VERTEX_SE2": g2o, b"EDGE_SE2": g2o, b"VERTEX_XY": g2o}
-_KEYWORDS |= dict.fromkeys((b"FLASER", b"ODOM", b"ROBOTLASER1", b"PARAM", b"RLASER"), carmen)
+_KEYWORDS |= dict.fromkeys((*carmen.SCAN_KEYWORDS, b"ODOM", b"PARAM", b"RLASER"), carmen)
 
 
 class NamedLog(NamedTuple):
@@ -41,30 +44,49 @@ def read_log(
     range_max: float = DEFAULT_RANGE_MAX,
     scan_topic: str | None = None,
     odometry_topic: str | None = None,
+    mount: Sequence[float] | None = None,
+    upside_down: bool = False,
+    scan_frame: str | None = None,
+    base_frame: str | None = None,
+    odom_frame: str | None = None,
+    angle_increment: float | None = None,
 ) -> LaserLog:
-    """Read a log: CARMEN log, ROS bag, g2o pose graph with scans, or NumPy file (`npz`).
+    """Read a log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file (`npz`).
+
+    What had to be corrected or assumed is in `LaserLog.notes`.
 
     Args:
         path: The log, or the name of one of `NAMED_LOGS`.
-        range_max: Range [m] from which on a reading counts as no return.
+        range_max: Range [m] from which on a reading counts as no return, unless the scanner's own
+            is smaller.
         scan_topic: Topic of the laser scans in a bag.
         odometry_topic: Topic of the odometry or of the transforms in a bag.
+        mount: Pose (x, y, yaw) [m, m, rad] of the scanner on the robot, instead of that by
+            transforms or parameters of the log.
+        upside_down: Whether the scanner is mounted upside down.
+        scan_frame: Frame of the scans to read, if there are several scanners.
+        base_frame: Frame of the robot, which the odometry moves.
+        odom_frame: Frame of the odometry among the transforms.
+        angle_increment: Step [rad] between beams, instead of that of the scans.
 
     Raises:
-        InputError: `path` is no path, `range_max` is not positive, the format of the log is
-            unknown, topics are named for a log without topics, or the reader of the format raises
-            it.
+        InputError: `path` is no path, an option is impossible, the format of the log is unknown,
+            topics are named for a log without topics, or the log cannot be read or assembled.
     """
-    check_range_max(range_max, infinite=True)
+    options = LogOptions(
+        range_max, mount, upside_down, scan_frame, base_frame, odom_frame, angle_increment
+    )
+    check_options(options)
     path = find_log(path)
     reader = reader_of(path)
+    raw: RawLog
     if reader is ros_bags:
-        return ros_bags.read(
-            path, range_max=range_max, scan_topic=scan_topic, odometry_topic=odometry_topic
-        )
-    if scan_topic is not None or odometry_topic is not None:
+        raw = ros_bags.read_raw(path, scan_topic=scan_topic, odometry_topic=odometry_topic)
+    elif scan_topic is not None or odometry_topic is not None:
         raise InputError("has no topics", path=path, advice="name topics only for ROS bags")
-    return reader.read(path, range_max=range_max)
+    else:
+        raw = reader.read_raw(path)
+    return assemble(path, raw, options)
 
 
 def find_log(path: str | PathLike) -> Path:
@@ -94,7 +116,7 @@ def reader_of(path: Path) -> ModuleType:
         InputError: The file cannot be read, or has no line of a known format among the first
             `MAX_LINES_SEARCHED`.
     """
-    if ros_bags.is_bag(path):
+    if bag_files.is_bag(path):
         return ros_bags
     if path.is_file() and _is_npz(path):
         return npz
@@ -102,10 +124,12 @@ def reader_of(path: Path) -> ModuleType:
         keyword = text.split(maxsplit=1)[:1]
         if keyword and keyword[0] in _KEYWORDS:
             return _KEYWORDS[keyword[0]]
+        if player.is_line(text):
+            return player
         if number >= MAX_LINES_SEARCHED:
             break
     problem = "is a log of no known format"
-    advice = "the formats are CARMEN logs, ROS bags, g2o pose graphs with scans, NumPy files"
+    advice = "the formats are CARMEN and Player logs, ROS bags, g2o graphs with scans, NumPy files"
     raise InputError(problem, path=path, advice=advice)
 
 

@@ -1,59 +1,40 @@
-"""ROBOTLASER1 lines: scans of newer CARMEN logs, also used in g2o pose graphs.
+"""ROBOTLASER1 and RAWLASER1 lines: scans of newer CARMEN logs, also used in g2o pose graphs.
 
     ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m
         laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side axis
+        time host logger_time
+    RAWLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m
         time host logger_time
 
 n ranges, m remissions; the poses are by odometry.
 """
 
 import math
-from collections import Counter
-from collections.abc import Mapping
-from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from jaxslam.io.errors import InputError
+from jaxslam.io.raw_log import RawScan
 from jaxslam.io.text import number
 
+_SCAN = "type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m"
+_TAIL = "time host logger_time"
 FORM = (
-    "ROBOTLASER1 type first field step max accuracy remission n r_1 .. r_n m s_1 .. s_m, 3 "
-    "numbers of the laser's pose, 3 of the robot's, tv rv forward side axis time host logger_time"
+    f"ROBOTLASER1 {_SCAN}, 3 numbers of the laser's pose, 3 of the robot's, tv rv forward side "
+    f"axis {_TAIL}"
 )
-
-Name = TypeVar("Name")
-"""What scans are numbered or named by."""
+RAW_FORM = f"RAWLASER1 {_SCAN} {_TAIL}"
 
 
-class RobotLaser(NamedTuple):
-    """A laser scan.
-
-    Attributes:
-        line: Number of its line.
-        time: [s].
-        angle_min: [rad] direction of the first beam.
-        angle_increment: [rad] from one beam to the next.
-        range_max: [m] largest range.
-        ranges: (R,) float64 [m].
-        pose: (3,) [m, m, rad] of the laser, by odometry.
-    """
-
-    line: int
-    time: float
-    angle_min: float
-    angle_increment: float
-    range_max: float
-    ranges: np.ndarray
-    pose: tuple[float, ...]
-
-
-def parse(line: int, fields: list[bytes]) -> RobotLaser:
-    """The scan of a line.
+def parse(
+    line: int, fields: list[bytes], frame: str
+) -> tuple[RawScan, tuple[float, float, float] | None]:
+    """The scan of a line, and the pose of the laser by odometry; None in RAWLASER1.
 
     Args:
         line: Number of the line.
         fields: Its fields.
+        frame: Name for the scanner.
 
     Raises:
         InputError: There are too few or too many fields, or one is no number or out of range. It
@@ -67,11 +48,12 @@ def parse(line: int, fields: list[bytes]) -> RobotLaser:
     num_beams = int(count)
     end = 9 + num_beams
     remissions = number(fields[end], f"field {end + 1} (m)") if len(fields) > end else 0.0
-    num_fields = 24 + num_beams + remissions
+    has_pose = fields[0] != b"RAWLASER1"
+    num_fields = (24 if has_pose else 13) + num_beams + remissions
     if len(fields) != num_fields:
         raise InputError(f"cut or damaged: {len(fields)} fields instead of {num_fields:g}")
-    angle_min, angle_increment, range_max = (number(fields[i], f"field {i + 1}") for i in (2, 4, 5))
-    if not 0.0 < angle_increment <= math.pi or not 0.0 < range_max:
+    angle_min, step, range_max = (number(fields[i], f"field {i + 1}") for i in (2, 4, 5))
+    if not 0.0 < step <= math.pi or not 0.0 < range_max:
         raise InputError("step or maximum range is not positive", field="fields 5 and 6")
     try:
         ranges = np.array([float(field) for field in fields[9:end]])
@@ -79,27 +61,22 @@ def parse(line: int, fields: list[bytes]) -> RobotLaser:
         raise InputError("a range is not a number") from None
     if np.isnan(ranges).any():
         raise InputError("a range is not a number")
-    names = ("laser_x", "laser_y", "laser_theta")
-    pose = tuple(number(field, name) for field, name in zip(fields[-14:-11], names, strict=True))
     time = number(fields[-3], "time")
-    return RobotLaser(line, time, angle_min, angle_increment, range_max, ranges, pose)
+    received = logger_time(fields)
+    scan = RawScan(time, received, line, frame, angle_min, step, range_max, ranges)
+    return scan, _pose(fields) if has_pose else None
 
 
-def same_scanner(scans: Mapping[Name, RobotLaser]) -> tuple[dict[Name, RobotLaser], dict[int, str]]:
-    """Select the scans with the most frequent scanner metadata.
+def logger_time(fields: list[bytes]) -> float:
+    """Time [s] at which a line of CARMEN was logged, its last field; NaN if that is no number."""
+    try:
+        return float(fields[-1])
+    except ValueError:
+        return math.nan
 
-    Args:
-        scans: Scans by any key.
 
-    Returns:
-        The selected scans, and what is wrong with the others by line number.
-    """
-    if not scans:
-        return {}, {}
-
-    def metadata(scan: RobotLaser) -> tuple[float, ...]:
-        return scan.angle_min, scan.angle_increment, scan.range_max, scan.ranges.size
-
-    usual = Counter(map(metadata, scans.values())).most_common(1)[0][0]
-    others = {scan.line: "another scanner" for scan in scans.values() if metadata(scan) != usual}
-    return {name: scan for name, scan in scans.items() if scan.line not in others}, others
+def _pose(fields: list[bytes]) -> tuple[float, float, float]:
+    """Pose [m, m, rad] of the laser in a ROBOTLASER1 line."""
+    names = ("laser_x", "laser_y", "laser_theta")
+    x, y, theta = (number(field, name) for field, name in zip(fields[-14:-11], names, strict=True))
+    return x, y, theta

@@ -1,43 +1,30 @@
 """ROS 1 and ROS 2 bags, read by the library rosbags; ROS itself is not needed.
 
-Scans are `sensor_msgs/LaserScan`. Odometry is `nav_msgs/Odometry` or, without such a topic, the
-transform from `odom` to the robot in `/tf`. The pose of the scanner in the robot frame
-(`base_link`) is taken from the transforms; without any, the scanner is at the origin of the
-robot. The poses of the log are those of the scanner.
+Scans are `sensor_msgs/LaserScan` or `sensor_msgs/MultiEchoLaserScan`, of which the first echo is
+taken. Odometry is `nav_msgs/Odometry` or, without such a topic, the transform from `odom` to the
+robot in `/tf`. The poses of the log are those of the scanner.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam.core.logs import (
-    DEFAULT_RANGE_MAX,
-    DEFAULT_RANGE_STD,
-    MAX_BROKEN_FRACTION,
-    LaserLog,
-    mark_no_return,
-)
-from jaxslam.core.scan import Lidar
-from jaxslam.core.se2_np import compose
-from jaxslam.core.time_series import interpolate_poses
-from jaxslam.io.errors import InputError, check_range_max
-from jaxslam.io.ros_transforms import (
-    Transform,
-    add_transform,
-    frame_name,
-    mount_pose,
-    odometry_of_transforms,
-    planar_pose,
-    seconds,
-)
+from jaxslam.core.logs import DEFAULT_RANGE_MAX, MAX_BROKEN_FRACTION, LaserLog
+from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.bag_files import open_bag
+from jaxslam.io.errors import InputError
+from jaxslam.io.mounts import frame_name
+from jaxslam.io.quaternions import headings
+from jaxslam.io.raw_log import RawLog, RawOdometry, RawScan, RawTransform, as_odometry
 from jaxslam.io.text import with_progress
 
-SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+SCAN, MULTI_ECHO = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"
+ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"  # the latter in old bags
 
 
@@ -46,39 +33,11 @@ class Topics(NamedTuple):
 
     Attributes:
         scans: Topic of the laser scans.
-        odometry: Topic of the odometry or of the transforms.
+        odometry: Topic of the odometry or of the transforms; "" if there is neither.
     """
 
     scans: str
     odometry: str
-
-
-class _Scan(NamedTuple):
-    """One `LaserScan` message."""
-
-    time: float  # [s]
-    angle_min: float  # [rad]
-    angle_increment: float  # [rad]
-    range_max: float  # [m]
-    ranges: np.ndarray  # (R,) float64 [m], infinite where below the scanner's range_min
-
-
-class _Messages(NamedTuple):
-    """Content of the messages of a bag."""
-
-    scans: list[_Scan]  # those that are not broken
-    broken: int  # number of broken scans
-    scan_frame: str  # "" without scans
-    base_frame: str  # frame of the robot; "" if unknown
-    odometry: list[tuple[float, float, float, float]]  # t x y heading [s, m, m, rad] of the robot
-    transforms: dict[str, Transform]  # by child frame
-
-
-def is_bag(path: Path) -> bool:
-    """Whether the name of a file, or the content of a folder, is that of a bag."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    return path.suffix in (".bag", ".db3", ".mcap")
 
 
 def read(
@@ -100,12 +59,33 @@ def read(
 
     Raises:
         InputError: `range_max` is not positive, rosbags is not installed, the bag cannot be read or
-            lacks scans or odometry, or more than 5 % of its scans are broken.
+            lacks scans, more than 5 % of its scans are broken, or as `assemble`.
     """
-    check_range_max(range_max, infinite=True)
-    with _open_bag(Path(path)) as bag:
-        chosen = _choose_topics(path, bag, scan_topic, odometry_topic)
-        return _build_log(path, chosen, _read_messages(path, bag, chosen), range_max)
+    options = LogOptions(range_max=range_max)
+    check_options(options)
+    raw = read_raw(path, scan_topic=scan_topic, odometry_topic=odometry_topic)
+    return assemble(path, raw, options)
+
+
+def read_raw(
+    path: str | PathLike,
+    *,
+    scan_topic: str | None = None,
+    odometry_topic: str | None = None,
+) -> RawLog:
+    """Scans, odometry and transforms of a bag, in order of their reception.
+
+    Args:
+        path: The bag.
+        scan_topic: As for `read`.
+        odometry_topic: As for `read`.
+
+    Raises:
+        InputError: As `read`.
+    """
+    with open_bag(Path(path)) as bag:
+        chosen, notes = _choose_topics(path, bag, scan_topic, odometry_topic)
+        return _read_messages(path, bag, chosen, notes)
 
 
 def topics(path: str | PathLike) -> Topics:
@@ -114,155 +94,157 @@ def topics(path: str | PathLike) -> Topics:
     Raises:
         InputError: As `read`.
     """
-    with _open_bag(Path(path)) as bag:
-        return _choose_topics(path, bag, None, None)
-
-
-@contextmanager
-def _open_bag(path: Path) -> Iterator[Any]:
-    """Open a bag; any error while it is read becomes an InputError."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        advice = "pip install '.[ros]'"
-        raise InputError("is a ROS bag, which needs rosbags", path=path, advice=advice) from None
-    bag_path = path.parent if path.suffix in (".db3", ".mcap") else path
-    if not bag_path.exists():
-        raise InputError("does not exist", path=path, advice="check the name")
-    try:
-        with AnyReader([bag_path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
-            yield bag
-    except InputError:
-        raise
-    except Exception as error:  # rosbags does not document what a damaged bag raises
-        reason = " ".join(str(error).split())[:200]
-        problem = f"is a bag that cannot be read ({type(error).__name__}: {reason})"
-        raise InputError(problem, path=path, advice="copy it again, or reindex it") from None
+    with open_bag(Path(path)) as bag:
+        return _choose_topics(path, bag, None, None)[0]
 
 
 def _choose_topics(
     path: str | PathLike, bag: Any, scans: str | None, odometry: str | None
-) -> Topics:
-    """The requested topics; of those not requested, the topic with most messages."""
+) -> tuple[Topics, list[str]]:
+    """The requested topics; of those not requested, the topic with most messages; and notes."""
     types = {connection.topic: connection.msgtype for connection in bag.connections}
     counts: Counter[str] = Counter()
     for connection in bag.connections:
         counts[connection.topic] += connection.msgcount
 
-    def choose(requested: str | None, field: str, allowed: tuple[str, ...]) -> str:
-        usable = {name: kind for name, kind in types.items() if kind in allowed and counts[name]}
-        if requested is not None and requested not in usable:
-            problem = f"there is no {allowed[0]} in {requested!r}"
-            advice = f"topics of that type: {', '.join(sorted(usable)) or 'none'}"
+    def usable(*allowed: str) -> list[str]:
+        names = [name for name, kind in types.items() if kind in allowed and counts[name]]
+        return sorted(names, key=lambda name: (-counts[name], name))
+
+    def choose(requested: str | None, field: str, names: list[str], kind: str) -> str:
+        if requested is not None and requested not in names:
+            problem = f"there is no {kind} in {requested!r}"
+            advice = f"topics of that type: {', '.join(sorted(names)) or 'none'}"
             raise InputError(problem, path=path, field=field, advice=advice)
-        if not usable:
-            names = " or ".join(allowed)
-            listed = ", ".join(sorted(types)) or "none"
-            advice = f"name another bag; its topics are: {listed}"
-            raise InputError(f"has no {names}", path=path, advice=advice)
-        preferred = min(allowed.index(kind) for kind in usable.values())
-        best = [name for name, kind in usable.items() if allowed.index(kind) == preferred]
-        return requested or max(sorted(best), key=counts.__getitem__)
+        return requested or next(iter(names), "")
 
-    return Topics(
-        choose(scans, "scans", (SCAN,)),
-        choose(odometry, "odometry", (ODOMETRY, *TRANSFORMS)),
+    scan_topics = usable(SCAN) + usable(MULTI_ECHO)
+    chosen = Topics(
+        choose(scans, "scans", scan_topics, SCAN),
+        choose(odometry, "odometry", usable(ODOMETRY) + usable(*TRANSFORMS), ODOMETRY),
     )
+    if not chosen.scans:
+        listed = ", ".join(sorted(types)) or "none"
+        advice = f"name another bag; its topics are: {listed}"
+        raise InputError(f"has no {SCAN}", path=path, advice=advice)
+    others = [f"{name} ({counts[name]})" for name in scan_topics if name != chosen.scans]
+    if scans is not None or not others:
+        return chosen, []
+    note = f"scans of {chosen.scans} are used, not of {', '.join(others)}; --scan-topic chooses"
+    return chosen, [note]
 
 
-def _read_messages(path: str | PathLike, bag: Any, chosen: Topics) -> _Messages:
+def _read_messages(path: str | PathLike, bag: Any, chosen: Topics, notes: list[str]) -> RawLog:
     """Read the chosen topics and all transforms."""
-    scans: list[_Scan] = []
-    odometry: list[tuple[float, float, float, float]] = []
-    transforms: dict[str, Transform] = {}
-    scan_frame, base_frame = "", ""
-    broken = 0
-    connections = [
-        connection
-        for connection in bag.connections
-        if connection.topic in chosen
-        or (connection.msgtype in TRANSFORMS and "tf" in connection.topic)
-    ]
-    count = sum(connection.msgcount for connection in connections)
-    messages = bag.messages(connections=connections)
-    for connection, _, raw in with_progress(messages, Path(path), "message", count):
-        message = bag.deserialize(raw, connection.msgtype)
-        if connection.topic == chosen.scans:
-            scan = _parse_scan(message)
+    scans: list[RawScan] = []
+    rows: list[tuple[float, ...]] = []
+    transforms: dict[tuple[str, str], RawTransform] = {}
+    base_frame, broken = "", 0
+    for order, received, kind, message in _messages(path, bag, chosen):
+        if kind in (SCAN, MULTI_ECHO):
+            scan = _parse_scan(message, received, order)
             broken += scan is None
             if scan is not None:
                 scans.append(scan)
-                scan_frame = scan_frame or frame_name(message.header.frame_id)
-        elif connection.msgtype == ODOMETRY:
-            pose = message.pose.pose
-            planar = planar_pose(pose.position, pose.orientation)
+        elif kind == ODOMETRY:
+            rows.append(
+                (_seconds(message.header.stamp), received, order, *_pose(message.pose.pose))
+            )
             base_frame = base_frame or frame_name(message.child_frame_id)
-            if np.isfinite(planar).all():
-                odometry.append((seconds(message.header.stamp), *planar))
         else:
-            for transform in message.transforms:
-                add_transform(transforms, transform)
-    if not odometry:
-        base_frame, odometry = odometry_of_transforms(path, transforms)
-    return _Messages(scans, broken, scan_frame, base_frame, odometry, transforms)
-
-
-def _build_log(
-    path: str | PathLike, chosen: Topics, messages: _Messages, range_max: float
-) -> LaserLog:
-    """Interpolate the odometry at the scans; move it to the scanner; beams counter-clockwise."""
-    scans, other_scanner = _with_first_scanner(messages.scans)
-    stream = np.array(sorted(messages.odometry))
-    inside = [scan for scan in scans if stream[0, 0] <= scan.time <= stream[-1, 0]]
-    skipped = messages.broken + other_scanner + len(scans) - len(inside)
-    total = len(inside) + skipped
-    if not inside or skipped > MAX_BROKEN_FRACTION * total:
-        problem = f"{skipped} of {total} scans are broken, or outside the time of {chosen.odometry}"
-        raise InputError(problem, path=path, advice="compare their time stamps")
-    mount, flipped = mount_pose(messages.transforms, messages.scan_frame, messages.base_frame)
-    poses = compose(stream[:, 1:], mount)
-    times = np.array([scan.time for scan in inside])
-    order = np.argsort(times, kind="stable")
-    ranges = np.array([inside[index].ranges for index in order])
-    first = inside[0]
-    angle_min, angle_increment = first.angle_min, first.angle_increment
-    if (angle_increment < 0.0) != flipped:  # the beams are clockwise in the robot frame
-        ranges = ranges[:, ::-1]
-        angle_min = angle_min + angle_increment * (ranges.shape[1] - 1)
-    if flipped:
-        angle_min = -angle_min
-    range_max = min(range_max, first.range_max)
-    return LaserLog(
-        times=times[order],
-        odom_poses=interpolate_poses(times[order], stream[:, 0], poses),
-        ranges=mark_no_return(ranges, range_max),
-        lidar=Lidar(ranges.shape[1], angle_min, abs(angle_increment), range_max, DEFAULT_RANGE_STD),
-        num_skipped=skipped,
-        odom_stream_times=stream[:, 0],
-        odom_stream_poses=poses,
-        source=f", scans of {chosen.scans}, odometry of {chosen.odometry}",
+            for one in message.transforms:
+                _add_transform(transforms, one, received, order)
+    total = len(scans) + broken
+    if broken > MAX_BROKEN_FRACTION * total:
+        problem = f"{broken} of {total} scans of {chosen.scans} are broken"
+        advice = "their angles are not numbers, or they have fewer than two beams"
+        raise InputError(problem, path=path, advice=advice)
+    odometry, more = _as_odometry(rows)
+    return RawLog(
+        scans=scans,
+        odometry=odometry,
+        base_frame=base_frame,
+        transforms=transforms,
+        names_frames=True,
+        source=f", scans of {chosen.scans}, odometry of {chosen.odometry or 'none'}",
+        num_skipped=broken,
+        notes=(*notes, *more),
     )
 
 
-def _parse_scan(message: Any) -> _Scan | None:
+def _messages(
+    path: str | PathLike, bag: Any, chosen: Topics
+) -> Iterator[tuple[int, float, str, Any]]:
+    """Place, time of reception [s], type and content of each message of interest."""
+    connections = [
+        connection
+        for connection in bag.connections
+        if connection.topic in chosen or connection.msgtype in TRANSFORMS
+    ]
+    count = sum(connection.msgcount for connection in connections)
+    messages = with_progress(bag.messages(connections=connections), Path(path), "message", count)
+    for order, (connection, received, raw) in enumerate(messages):
+        kind = connection.msgtype
+        yield order, 1e-9 * received, kind, bag.deserialize(raw, kind)
+
+
+def _seconds(stamp: Any) -> float:
+    """Seconds of a ROS time stamp."""
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def _pose(pose: Any) -> tuple[float, ...]:
+    """Position x y [m] and quaternion x y z w of a `geometry_msgs/Pose`."""
+    position, turn = pose.position, pose.orientation
+    return position.x, position.y, turn.x, turn.y, turn.z, turn.w
+
+
+def _as_odometry(rows: list[tuple[float, ...]]) -> tuple[RawOdometry, list[str]]:
+    """Odometry of rows (own, received, order, x, y, quaternion), and notes on the quaternions."""
+    finite = [row for row in rows if all(map(math.isfinite, row))]
+    if not finite:
+        return as_odometry([]), []
+    table = np.array(finite)
+    heading, valid, notes = headings(table[:, 5:])
+    poses = np.column_stack([table[:, :5], heading])[valid]
+    return as_odometry(list(map(tuple, poses))), notes
+
+
+def _add_transform(
+    transforms: dict[tuple[str, str], RawTransform], message: Any, received: float, order: int
+) -> None:
+    """Add a `TransformStamped`; one that is not finite is skipped."""
+    position, turn = message.transform.translation, message.transform.rotation
+    values = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
+    if not all(map(math.isfinite, values)):
+        return
+    pair = frame_name(message.header.frame_id), frame_name(message.child_frame_id)
+    transform = transforms.setdefault(pair, RawTransform(*pair, [], []))
+    transform.stamps.append((_seconds(message.header.stamp), received, order))
+    transform.values.append(values)
+
+
+def _parse_scan(message: Any, received: float, order: int) -> RawScan | None:
     """The scan of a message; None if it is broken."""
-    ranges = np.asarray(message.ranges, np.float64).copy()
-    increment, range_max = float(message.angle_increment), float(message.range_max)
-    metadata = float(message.angle_min), increment, range_max
-    if ranges.size < 2 or not np.isfinite(metadata).all() or increment == 0.0 or range_max <= 0.0:
+    ranges = _first_echoes(message.ranges)
+    first, step = float(message.angle_min), float(message.angle_increment)
+    if ranges.size < 2 or not math.isfinite(first):
         return None
-    ranges[~(ranges >= max(float(message.range_min), 0.0))] = np.inf
-    return _Scan(seconds(message.header.stamp), metadata[0], increment, range_max, ranges)
+    if not math.isfinite(step) or step == 0.0:
+        step = (float(message.angle_max) - first) / (ranges.size - 1)
+    if not 0.0 < abs(step) <= math.pi:
+        return None
+    range_max, range_min = float(message.range_max), float(message.range_min)
+    range_max = range_max if range_max > 0.0 else math.inf  # 0 and NaN: not stated
+    ranges[~(ranges >= (range_min if range_min > 0.0 else 0.0))] = np.inf
+    ranges[ranges >= range_max] = np.inf
+    frame = frame_name(message.header.frame_id)
+    time = _seconds(message.header.stamp)
+    return RawScan(time, received, order, frame, first, step, range_max, ranges)
 
 
-def _with_first_scanner(scans: list[_Scan]) -> tuple[list[_Scan], int]:
-    """Scans with the metadata of the first, and the number of the others."""
-    if not scans:
-        return scans, 0
-
-    def metadata(scan: _Scan) -> tuple[float, ...]:
-        return scan.angle_min, scan.angle_increment, scan.range_max, scan.ranges.size
-
-    same = [scan for scan in scans if metadata(scan) == metadata(scans[0])]
-    return same, len(scans) - len(same)
+def _first_echoes(ranges: Any) -> np.ndarray:
+    """Ranges (R,) float64 [m] of a scan; of several echoes the first."""
+    if len(ranges) and hasattr(ranges[0], "echoes"):
+        ranges = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in ranges]
+    return np.array(ranges, np.float64)

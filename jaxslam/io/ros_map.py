@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from jaxslam.io.text import lines
 MAX_YAML_BYTES = 2**16  # [bytes] of the longest YAML file
 FORMATS = ("PPM", "PNG", "BMP")  # PPM stands for all of PBM, PGM and PPM
 MODES = ("trinary", "scale", "raw")
+UNKNOWN_SHADE, FREE_SHADE = 205, 254  # [0, 255] that map_saver writes; 254 and 255 are free
+UNKNOWN_PROBABILITY = 1 - UNKNOWN_SHADE / 255
 FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 
@@ -70,12 +72,21 @@ def read(path: str | PathLike) -> OccupancyMap:
     if free_below >= occupied_above:
         problem = f"{free_below} is not below the occupied_thresh of {occupied_above}"
         raise InputError(problem, path=path, field="free_thresh")
-    shade, known = _read_image(_image_path(path, fields["image"]))
+    image, notes = _image_path(path, fields["image"])
+    shade, known = _read_image(image)
     probability = _occupancy_probability(shade, mode, bool(negate))
     known &= np.isfinite(probability)
+    if mode == "trinary" and not negate and UNKNOWN_PROBABILITY < free_below:
+        is_unknown = _written_as_unknown(shade)
+        if is_unknown.any():
+            known &= ~is_unknown
+            notes.append(
+                f"cells of the shade {UNKNOWN_SHADE}, which map_saver writes for unknown, stay "
+                f"unknown, although the free_thresh of {free_below:g} would make them free"
+            )
     occupied = _image_to_grid(known & (probability > occupied_above))
     free = _image_to_grid(known & (probability < free_below))
-    return OccupancyMap(occupied, free, resolution, origin)
+    return OccupancyMap(occupied, free, resolution, origin, tuple(notes))
 
 
 def write(path: str | PathLike, occupancy: OccupancyMap) -> None:
@@ -127,6 +138,13 @@ def _occupancy_probability(shade: np.ndarray, mode: str, negate: bool) -> np.nda
     return np.where(percent <= 100.0, percent / 100.0, np.nan)
 
 
+def _written_as_unknown(shade: np.ndarray) -> np.ndarray:
+    """Cells (H, W) bool of the shade for unknown, if the picture has one for free, too."""
+    levels = np.round(255.0 * shade)
+    is_unknown = (levels == UNKNOWN_SHADE) & (np.abs(255.0 * shade - levels) < 0.1)
+    return is_unknown & bool((levels >= FREE_SHADE).any())
+
+
 def _load(path: Path) -> Mapping[str, Any]:
     """The fields of a map's YAML file, not yet checked."""
     try:
@@ -170,18 +188,26 @@ def _excerpt(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def _image_path(path: Path, name: Any) -> Path:
-    """Path of a map's image, which must be in the map's folder or below."""
+def _image_path(path: Path, name: Any) -> tuple[Path, list[str]]:
+    """Path of a map's image, which must be in the map's folder or below, and notes.
+
+    An absolute path of another machine stands for the image of that name beside the YAML file.
+    """
     if not isinstance(name, str) or not name or "\0" in name:
         raise InputError(f"{_excerpt(name)} is no file name", path=path, field="image")
-    image = path.parent / name
+    image, notes = path.parent / name, []
+    beside = path.parent / PureWindowsPath(name).name
+    if PureWindowsPath(name).is_absolute() or name.startswith("/"):
+        if beside.is_file():
+            notes = [f"image {_excerpt(name)} is taken to be {beside.name!r} beside the YAML file"]
+            image = beside
     folders = {path.parent.resolve(), path.resolve().parent}
     inside = any(image.resolve().is_relative_to(folder) for folder in folders)
-    if Path(name).is_absolute() or not inside:
+    if not inside or image != beside and Path(name).is_absolute():
         problem = f"{_excerpt(name)} is outside the map's folder"
         advice = "put the image beside the YAML file and name it without its folder"
         raise InputError(problem, path=path, field="image", advice=advice)
-    return image
+    return image, notes
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray]:

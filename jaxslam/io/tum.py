@@ -8,8 +8,12 @@ import numpy as np
 from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_text
+from jaxslam.io.quaternions import yaw_of
 from jaxslam.io.text import rows
 
+PLANAR = 0.05  # of a quaternion: roll and pitch that a robot in the plane may have
+MIN_TURN = 0.5  # [rad] by which a path turns that must have other headings than 0
+MAX_STEPS = 200  # of the path that are looked at, for the direction of each
 FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -23,6 +27,20 @@ def read(path: str | PathLike) -> tuple[np.ndarray, np.ndarray]:
         InputError: The file cannot be read, or a line is not eight finite numbers of which the
             last four are a unit quaternion.
     """
+    return read_reference(path)[0]
+
+
+def read_reference(
+    path: str | PathLike,
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[str, ...]]:
+    """The trajectory, as `read`, and notes on what it lacks.
+
+    Headings are NaN where quaternions are written in another order, or say nothing although the
+    path turns.
+
+    Raises:
+        InputError: As `read`.
+    """
     table = rows(path, FIELDS, "a TUM trajectory")
     for line, fields in table:
         norm = math.hypot(*fields[4:])
@@ -31,9 +49,29 @@ def read(path: str | PathLike) -> tuple[np.ndarray, np.ndarray]:
             advice = "the last four fields are qx qy qz qw"
             raise InputError(problem, path=path, line=line, field="qx qy qz qw", advice=advice)
     values = np.array([fields for _, fields in table])
-    x, y, z, w = (values[:, 4:] / np.linalg.norm(values[:, 4:], axis=1, keepdims=True)).T
-    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return values[:, 0].copy(), np.column_stack([values[:, 1:3], heading])
+    quaternions = values[:, 4:] / np.linalg.norm(values[:, 4:], axis=1, keepdims=True)
+    heading = yaw_of(quaternions)
+    notes: tuple[str, ...] = ()
+    problem = _heading_problem(values[:, 1:3], quaternions)
+    if problem:
+        heading = np.full(len(values), np.nan)
+        notes = (f"{problem}: errors of the heading are left out",)
+    poses = np.column_stack([values[:, 1:3], heading])
+    return (values[:, 0].copy(), poses), notes
+
+
+def _heading_problem(positions: np.ndarray, quaternions: np.ndarray) -> str:
+    """Why the quaternions (N, 4) are no headings of the path (N, 2); "" if they may be."""
+    x, y, z, w = np.abs(quaternions.T)
+    if max(np.quantile(y, 0.9), np.quantile(z, 0.9)) < PLANAR and x.max() > 0.5:
+        return "quaternions have w first, not last"
+    steps = np.diff(positions[:: max(len(positions) // MAX_STEPS, 1)], axis=0)
+    steps = steps[np.hypot(*steps.T) > 0.0]
+    if (w == 1.0).all() and len(steps) > 1:
+        along = steps / np.hypot(*steps.T)[:, None]
+        if (along @ along[0]).min() < math.cos(MIN_TURN):
+            return "quaternions hold no heading"
+    return ""
 
 
 def write(path: str | PathLike, times: AnyArray, poses: AnyArray) -> None:

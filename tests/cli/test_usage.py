@@ -53,10 +53,12 @@ def test_help_says_in_a_line_what_each_command_does(capsys):
 OPTIONS = {
     "simulate": "--world --trials --seed --noise --landmarks --labels --out",
     "run": "--reference --relations --odometry --smooth --no-smooth --noise --scan-topic "
-    "--odometry-topic --scan --gif --rerun --out",
+    "--odometry-topic --mount --upside-down --scan-frame --base-frame --odom-frame "
+    "--angle-increment --pose-frame --scan --gif --rerun --out",
     "map": "--robot-radius --min-obstacle-size --regions --out",
     "tune": "--test --reference --odometry --world --trials --heldout --loss --updates --batch "
-    "--patience --freeze --noise --seed --out",
+    "--patience --freeze --noise --mount --upside-down --scan-frame --base-frame --odom-frame "
+    "--angle-increment --seed --out",
 }
 
 

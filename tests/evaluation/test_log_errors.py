@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from jaxslam.core.se2_np import compose
 from jaxslam.evaluation import consistency, log_errors, trajectory
@@ -50,3 +51,13 @@ def test_relations_and_reference_are_evaluated_where_they_are_given():
     by_hand = trajectory.ate(times, poses + 0.1, times, poses)
     found = log_errors.against_reference(times, poses + 0.1, (times, poses))
     assert by_hand.items() <= found.items()
+
+
+def test_a_reference_without_headings_gives_no_errors_that_need_them():
+    times = np.arange(20.0)
+    poses = np.column_stack([np.cos(0.3 * times), np.sin(0.3 * times), 0.3 * times])
+    reference = times, np.column_stack([poses[:, :2], np.full(20, np.nan)])
+    numbers = log_errors.against_reference(times, poses, reference)
+    assert numbers["ate_rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    assert all(numbers[name] is None for name in log_errors.NEED_HEADING)
+    assert not log_errors.has_heading(reference) and log_errors.has_heading((times, poses))

@@ -75,3 +75,13 @@ def test_points_are_seen_before_the_ends_of_both_beams_beside_them():
 def test_bad_arguments_are_named_while_tracing(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         jax.eval_shape(call)
+
+
+def test_points_behind_the_robot_are_in_view_of_a_scanner_that_looks_there():
+    """Its beams go from 120 to 240 degrees, beyond pi."""
+    lidar = Lidar(5, np.radians(120.0), np.radians(30.0), 10.0, 0.01)
+    angles = np.radians([100.0, 125.0, 179.0, 181.0, 235.0, -100.0])
+    points = 2.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    want = [False, True, True, True, True, False]
+    np.testing.assert_array_equal(in_free_view(lidar, points, np.full(5, 3.0)), want)
+    np.testing.assert_array_equal(in_free_view(lidar, points, np.full(5, 1.0)), [False] * 6)

@@ -116,6 +116,38 @@ def test_tum_missing_file_and_folder(tmp_path):
     assert complaint(tum.read, tmp_path).startswith(": is a folder")
 
 
+def tum_file(path, order, headings):
+    """A path along a circle; quaternions of these headings, in this order of x y z w."""
+    rows = []
+    for i, yaw in enumerate(headings):
+        parts = {"x": 0.0, "y": 0.0, "z": np.sin(yaw / 2), "w": np.cos(yaw / 2)}
+        place = f"{np.cos(0.3 * i):.6f} {np.sin(0.3 * i):.6f} 0"
+        rows.append(f"{i} {place} {' '.join(repr(float(parts[name])) for name in order)}")
+    return save(path, "\n".join(rows) + "\n")
+
+
+HEADINGS = 0.3 * np.arange(20) + 1.0
+
+
+def test_a_reference_with_w_first_or_without_heading_has_no_headings(tmp_path):
+    (_, right), notes = tum.read_reference(tum_file(tmp_path / "a", "xyzw", HEADINGS))
+    np.testing.assert_allclose(np.cos(right[:, 2]), np.cos(HEADINGS))
+    assert notes == ()
+    for name, order, headings in (("b", "wxyz", HEADINGS), ("c", "xyzw", 0 * HEADINGS)):
+        (times, poses), notes = tum.read_reference(tum_file(tmp_path / name, order, headings))
+        assert np.isnan(poses[:, 2]).all() and len(notes) == 1 and "heading" in notes[0]
+        np.testing.assert_array_equal(poses[:, :2], right[:, :2])
+        np.testing.assert_array_equal(times, np.arange(20))
+    assert "w first" in tum.read_reference(tmp_path / "b")[1][0]
+
+
+def test_a_straight_drive_has_the_heading_zero(tmp_path):
+    path = save(tmp_path / "a", "".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(9)))
+    assert tum.read_reference(path)[1] == () and not tum.read(path)[1][:, 2].any()
+    path = save(tmp_path / "b", "".join(f"{i} {i} 0 0 1 0 0 0\n" for i in range(9)))
+    assert "w first" in tum.read_reference(path)[1][0]
+
+
 def test_tum_writes_nothing_that_is_not_finite(tmp_path):
     path = save(tmp_path / "a.tum", "before")
     poses = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]])

@@ -5,6 +5,7 @@ import resource
 import warnings
 import zipfile
 
+import layouts
 import numpy as np
 import pytest
 import test_carmen
@@ -19,7 +20,7 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import mrclam, noise_file, npz, readers, relations, ros_map, tum
 from jaxslam.io.errors import InputError
 
-COUNT = 150  # damaged files of each kind: 2,250 of all fifteen
+COUNT = 150  # damaged files of each kind: 2,850 of all nineteen
 MEMORY = 2**20  # [kB] that reading them all may take beyond what the tests had before
 HUGE = (b"1e999", b"-1e308", b"9" * 400, b"nan", b"-inf", b"1e-320", b"0", b"-1", b"", b"x\xff\x00")
 
@@ -124,6 +125,16 @@ def lasers():
     return [line.replace(" 1 2 3 ", f" {k} 2 3 ") for k, line in enumerate(still)]
 
 
+def raw_lasers():
+    """RAWLASER1 lines between ODOM lines, after the parameters of the mount."""
+    beams = "1.0 2.0 3.0 4.0 5.0"
+    scan = f"RAWLASER1 0 -1.0 2.0 0.5 8.0 0.01 0 5 {beams} 0"
+    lines = ["PARAM robot_frontlaser_offset 0.25 0 host 0"]
+    for t in range(12):
+        lines += [test_carmen.odom(t), f"{scan} {t} host {t}"]
+    return lines
+
+
 def bag(path, ros):
     test_ros_bags.write(path, ros, scans=3)
     return next(path.glob("*.db3")) if ros == 2 else path
@@ -172,6 +183,13 @@ KINDS = {
     "drive.clf": (lambda p: text(p, test_carmen.good(12)), readers.read_log),
     "drive.clf.gz": (lambda p: gzipped(p, test_carmen.good(12)), readers.read_log),
     "drive.log": (lambda p: text(p, lasers()), readers.read_log),
+    "raw.log": (lambda p: layouts.player(p, layouts.messages()[:30]), readers.read_log),
+    "old.log": (lambda p: layouts.player(p, layouts.messages()[:30], old=True), readers.read_log),
+    "bare.clf": (
+        lambda p: layouts.carmen(p, layouts.messages()[:30], poses=False),
+        readers.read_log,
+    ),
+    "raw.clf": (lambda p: text(p, raw_lasers()), readers.read_log),
     "graph.g2o": (lambda p: text(p, test_g2o.graph()), readers.read_log),
     "graph.zip": (lambda p: zipped(p, test_g2o.graph()), readers.read_log),
     "drive.npz": (arrays, readers.read_log),

@@ -16,12 +16,14 @@ def laser_log():
     ranges[1, 2] = np.inf
     return LaserLog(
         times=np.sort(rng.uniform(0, 9, T)),
-        odom_poses=rng.normal(size=(T, 3)),
+        odom_poses=np.cumsum(rng.normal(0.0, 0.1, (T, 3)), axis=0),
         ranges=ranges,
         lidar=Lidar(R, -1.0, 0.5, 10.0, 0.03),
         num_skipped=0,
         odom_stream_times=np.sort(rng.uniform(0, 9, 20)),
-        odom_stream_poses=rng.normal(size=(20, 3)),
+        odom_stream_poses=np.cumsum(rng.normal(0.0, 0.1, (20, 3)), axis=0),
+        odometry_stale=np.zeros(T, bool),
+        mount=np.array([0.1, 0.2, 0.3]),
     )
 
 

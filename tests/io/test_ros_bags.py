@@ -3,18 +3,15 @@ import shutil
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bag_messages import FIRST, LEAST, MOST, START, STEP, TRANSFORMS, Maker, quaternion
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jaxslam.core.se2 import compose
 from jaxslam.io import readers, ros_bags
 from jaxslam.io.errors import InputError
 
-START, SCANS, BEAMS = 1_600_000_000.25, 8, 6
-FIRST, STEP, LEAST, MOST = -0.9, 0.3, 0.1, 12.0
+SCANS, BEAMS = 8, 6
 MOUNT = np.array([0.25, -0.1, 0.3])  # of the scanner on the robot
-TRANSFORMS = ros_bags.TRANSFORMS[0]
-STORES = {1: Stores.ROS1_NOETIC, 2: Stores.ROS2_HUMBLE}
 
 
 def ranges():
@@ -24,57 +21,6 @@ def ranges():
 def pose_at(t):
     """Pose of the robot by odometry at a time since the start."""
     return np.interp(t, [0, 2, 9], [0, 1, 4]), 0.1 * t, 0.2 * t
-
-
-def quaternion(yaw, roll=0.0):
-    """Turned by `roll` about x, then by `yaw` about z."""
-    c, s, a, b = np.cos(yaw / 2), np.sin(yaw / 2), np.cos(roll / 2), np.sin(roll / 2)
-    return c * b, s * b, s * a, c * a
-
-
-class Maker:
-    """Messages of one of the two systems."""
-
-    def __init__(self, ros):
-        self.ros, self.store = ros, get_typestore(STORES[ros])
-        if ros == 1:
-            text = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(get_types_from_msg(text, TRANSFORMS))
-        self.of = self.store.types
-
-    def header(self, t, frame):
-        t += START
-        stamp = self.of["builtin_interfaces/msg/Time"](int(t), round(1e9 * (t - int(t))))
-        seq = {"seq": 0} if self.ros == 1 else {}
-        return self.of["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **seq)
-
-    def scan(self, t, reads, *, first=FIRST, step=STEP, frame="laser"):
-        last = first + step * (len(reads) - 1)
-        return self.of[ros_bags.SCAN](
-            self.header(t, frame), first, last, step, 0.0, 0.1, LEAST, MOST,
-            np.asarray(reads, np.float32), np.zeros(0, np.float32),
-        )  # fmt: skip
-
-    def odometry(self, t, pose):
-        of, cov = self.of, np.zeros(36)
-        point = of["geometry_msgs/msg/Point"](pose[0], pose[1], 0.0)
-        turn = of["geometry_msgs/msg/Quaternion"](*quaternion(pose[2]))
-        where = of["geometry_msgs/msg/Pose"](point, turn)
-        none = of["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-        speed = of["geometry_msgs/msg/Twist"](none, none)
-        return of[ros_bags.ODOMETRY](
-            self.header(t, "odom"), "base_link",
-            of["geometry_msgs/msg/PoseWithCovariance"](where, cov),
-            of["geometry_msgs/msg/TwistWithCovariance"](speed, cov),
-        )  # fmt: skip
-
-    def transform(self, t, parent, child, pose, roll=0.0):
-        of = self.of
-        move = of["geometry_msgs/msg/Vector3"](pose[0], pose[1], 0.2)
-        turn = of["geometry_msgs/msg/Quaternion"](*quaternion(pose[2], roll))
-        both = of["geometry_msgs/msg/Transform"](move, turn)
-        one = of["geometry_msgs/msg/TransformStamped"](self.header(t, parent), child, both)
-        return of[TRANSFORMS]([one])
 
 
 def write(path, ros, *, poses="odometry", mount=True, roll=0.0, scans=SCANS, **how):
@@ -206,14 +152,15 @@ def test_topics_can_be_named_and_wrong_ones_are_refused(tmp_path, ros):
         ros_bags.read(path, odometry_topic="/scan")
 
 
-def test_bags_without_scans_or_odometry_are_refused(tmp_path, ros):
-    path = write(place(tmp_path, ros), ros, poses="none", mount=False)
-    with pytest.raises(InputError, match="has no nav_msgs/msg/Odometry or tf2.*topics are: /scan"):
-        ros_bags.read(path)
-    other = tmp_path / "mount" / ("a.bag" if ros == 1 else "a")
-    other.parent.mkdir()
-    with pytest.raises(InputError, match="has no transform from 'odom'"):
-        ros_bags.read(write(other, ros, poses="none"))
+def test_bags_without_odometry_are_read_and_those_without_scans_refused(tmp_path, ros):
+    for mount in (False, True):
+        name = f"a{mount}.bag" if ros == 1 else f"a{mount}"
+        found = ros_bags.read(write(tmp_path / name, ros, poses="none", mount=mount))
+        assert not found.has_odometry and len(found.ranges) == SCANS and not found.odom_poses.any()
+        assert "no odometry: the log has none" in found.notes
+    name = "b.bag" if ros == 1 else "b"
+    with pytest.raises(InputError, match="has no sensor_msgs/msg/LaserScan; .*topics are: /odom"):
+        ros_bags.read(write(tmp_path / name, ros, scans=0))
     with pytest.raises(InputError, match="does not exist"):
         ros_bags.read(tmp_path / "none.bag")
 
@@ -235,3 +182,107 @@ def test_damaged_bags_never_end_in_a_traceback(tmp_path, ros):
             assert np.isfinite(ros_bags.read(path).odom_poses).all()
         except InputError as error:
             assert "\n" not in str(error)
+
+
+def write_messages(path, said, ros=2):
+    """A bag of (time, topic, type, message)."""
+    store = Maker(ros).store
+    with rosbag2.Writer(path, version=9) as writer:
+        known = {}
+        for t, topic, kind, message in said:
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(known[topic], int(1e9 * (START + t)), store.serialize_cdr(message, kind))
+    return path
+
+
+def with_wheels(*makers, count=12):
+    """Messages of the wheels, and of each function (i, time) a (topic, type, message)."""
+    make, said = Maker(2), []
+    for i in range(count):
+        said.append((float(i), "/odom", ros_bags.ODOMETRY, make.odometry(float(i), pose_at(i))))
+        said += [
+            (i + 0.5 - 0.5 * (i == count - 1), *one) for one in (f(make, i) for f in makers) if one
+        ]
+    return said
+
+
+def scan_from(frame, topic="/scan", every=1, offset=0.0):
+    def message(make, i):
+        if i % every:
+            return None
+        return topic, ros_bags.SCAN, make.scan(i + 0.4, ranges()[i % SCANS] + offset, frame=frame)
+
+    return message
+
+
+def test_two_scanners_on_one_topic_are_not_mixed(tmp_path):
+    said = with_wheels(scan_from("front"), scan_from("rear", every=2, offset=1.0))
+    path = write_messages(tmp_path / "a", said)
+    found = readers.read_log(path)
+    assert len(found.times) == 11 and np.array_equal(found.ranges[:8], ranges())
+    assert any("scans of 'front' are used, not those of 'rear' (6)" in x for x in found.notes)
+    rear = readers.read_log(path, scan_frame="/rear")
+    assert len(rear.times) == 6 and np.array_equal(rear.ranges[0], ranges()[0] + 1)
+
+
+def test_of_two_scanners_the_one_with_most_scans_is_named(tmp_path):
+    said = with_wheels(scan_from("front", every=3), scan_from("rear", "/scan_rear"))
+    path = write_messages(tmp_path / "a", said)
+    found = readers.read_log(path)
+    assert ", scans of /scan_rear" in found.source
+    assert any("not of /scan (4); --scan-topic chooses" in note for note in found.notes)
+    assert len(readers.read_log(path, scan_topic="/scan").times) == 4
+
+
+def test_of_several_echoes_the_first_is_read(tmp_path):
+    def message(make, i):
+        echo, one = make.of["sensor_msgs/msg/LaserEcho"], make.scan(i + 0.4, ranges()[i % SCANS])
+        beams = [echo(np.array([r, r + 1], np.float32)) for r in one.ranges]
+        beams[2] = echo(np.zeros(0, np.float32))
+        many = make.of[ros_bags.MULTI_ECHO](
+            one.header, one.angle_min, one.angle_max, one.angle_increment, 0.0, 0.1, LEAST, MOST,
+            beams, [],
+        )  # fmt: skip
+        return "/echoes", ros_bags.MULTI_ECHO, many
+
+    found = ros_bags.read(write_messages(tmp_path / "a", with_wheels(message)))
+    right = ranges().copy()
+    right[:, 2] = np.inf
+    np.testing.assert_array_equal(found.ranges[:8], right)
+
+
+@pytest.mark.parametrize("range_max", [np.inf, 0.0, np.nan])
+def test_a_range_max_that_is_not_stated_is_the_usual_one(tmp_path, range_max):
+    def message(make, i):
+        one = make.scan(i + 0.4, ranges()[i % SCANS])
+        one.range_max = range_max
+        return "/scan", ros_bags.SCAN, one
+
+    path = write_messages(tmp_path / "a", with_wheels(message))
+    found = ros_bags.read(path)
+    assert found.lidar.range_max == 20.0 and np.array_equal(found.ranges[:8], ranges())
+    assert ros_bags.read(path, range_max=30.0).lidar.range_max == 30.0
+    with pytest.raises(InputError, match="and the log states none"):
+        ros_bags.read(path, range_max=np.inf)
+
+
+def test_a_step_that_is_not_stated_follows_from_the_angles(tmp_path):
+    def message(make, i):
+        one = make.scan(i + 0.4, ranges()[i % SCANS])
+        one.angle_increment = 0.0
+        return "/scan", ros_bags.SCAN, one
+
+    found = ros_bags.read(write_messages(tmp_path / "a", with_wheels(message)))
+    assert found.lidar.angle_increment == pytest.approx(STEP) and found.num_skipped == 1
+
+
+def test_scans_without_angles_are_broken(tmp_path):
+    def message(make, i):
+        one = make.scan(i + 0.4, ranges()[i % SCANS])
+        one.angle_min = np.nan
+        return "/scan", ros_bags.SCAN, one
+
+    path = write_messages(tmp_path / "a", with_wheels(message))
+    with pytest.raises(InputError, match="12 of 12 scans of /scan are broken"):
+        ros_bags.read(path)

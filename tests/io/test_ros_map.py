@@ -246,3 +246,38 @@ def test_what_is_no_map_is_not_written(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
         ros_map.write(tmp_path / "a.yaml", grid._replace(**change))
     assert not list(tmp_path.iterdir())
+
+
+WRITTEN = np.array([[0, 0, 205], [205, 254, 254]], np.uint8)  # as map_saver writes
+
+
+@pytest.mark.parametrize("free", [0.196, 0.25])
+def test_unknown_stays_unknown_where_the_thresholds_contradict_it(write, free):
+    grid = ros_map.read(write(WRITTEN, free_thresh=free))
+    assert_cells(grid, WRITTEN == 0, WRITTEN == 254)
+    assert len(grid.notes) == (free == 0.25) and all("stay unknown" in x for x in grid.notes)
+
+
+def test_a_shade_that_is_not_for_unknown_is_what_the_thresholds_say(write):
+    """Raw and scale maps, other shades, and a map in which 205 is the only light shade."""
+    grid = ros_map.read(write(WRITTEN, free_thresh=0.25, mode="scale"))
+    assert_cells(grid, WRITTEN == 0, WRITTEN > 0)
+    grid = ros_map.read(write(np.where(WRITTEN == 205, 204, WRITTEN), free_thresh=0.25))
+    assert_cells(grid, WRITTEN == 0, WRITTEN > 0)
+    grid = ros_map.read(write(WRITTEN.clip(0, 205), free_thresh=0.25))
+    assert_cells(grid, WRITTEN == 0, WRITTEN > 0)
+    assert grid.notes == ()
+
+
+@pytest.mark.parametrize(
+    "name", ["/home/robot/maps/map.pgm", r"C:\\maps\\map.pgm", r"\\\\nas\\a\\map.pgm"]
+)
+def test_a_path_of_another_machine_is_the_image_beside(write, tmp_path, name):
+    path = write(WRITTEN)
+    path.write_text(path.read_text().replace("image: map.pgm", f'image: "{name}"'))
+    grid = ros_map.read(path)
+    assert_cells(grid, WRITTEN == 0, WRITTEN == 254)
+    assert len(grid.notes) == 1 and "is taken to be 'map.pgm' beside" in grid.notes[0]
+    (tmp_path / "map.pgm").unlink()
+    with pytest.raises(InputError, match="image: .* (outside|does not exist)|does not exist"):
+        ros_map.read(path)

@@ -1,0 +1,228 @@
+"""Checks of a log's odometry, the same for all formats: is it there, does it restart or latch?
+
+Many public logs hold poses corrected by a SLAM program in the lines of the scans, and the raw
+odometry in lines of their own; the odometry restarts at zero when a robot is switched off and on;
+a driver that is late gives several scans the same pose, and then leaps to the right one.
+
+A robot that reports driving backwards as driving forwards is found by scan matching alone.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.core.logs import MAX_BROKEN_FRACTION
+from jaxslam.core.se2_np import dead_reckoning, relative
+from jaxslam.core.time_series import interpolate_poses
+
+# [m], [rad] tolerance of `odometry_jumps`, beyond what `MAX_SPEED` allows
+MAX_STEP = np.array([1.0, 1.0])
+MAX_SPEED = np.array([5.0, 5.0])  # [m/s], [rad/s] no robot of these logs is faster
+SAME_FRAME_SPREAD = np.array([0.3, 0.1])  # [m], [rad] tolerance of `poses_are_corrected`
+MIN_OVERLAP = 0.9  # least fraction of the scans within the time of the odometry, for a comparison
+MIN_EXTENT = np.array([0.01, 0.01, 0.02])  # [m, m, rad] that an odometry which works exceeds
+MIN_POSES = 10  # fewer may have that little extent
+MAX_LATCHED = 4  # repetitions of a pose by a late driver; after more, the robot stood still
+LEAP_RATIO = 1.5  # of size and speed of a leap after latched poses, over those beside it
+MAX_SHARED_RATIO = 2.0  # of the speed of a leap that is shared out, over the speed beside it
+MIN_LEAP = 0.02  # [m] of such a leap; a radian counts as half a metre
+NEIGHBOURS = 5  # steps on either side that the usual speed is taken from
+MAX_GAP = 3.5  # [s] without odometry that needs no note
+MAX_GAP_RATIO = 20.0  # of such a gap over the usual step
+MIN_GAP_MOTION = 0.3  # [m] in such a gap; a radian counts as half a metre
+
+
+class CheckedOdometry(NamedTuple):
+    """Odometry after the checks.
+
+    Attributes:
+        poses: (N, 3) [m, m, rad].
+        is_stale: (N,) bool, whether the increment to a pose is not to be trusted: there was none
+            when it was needed, and what is here was interpolated or left out.
+        notes: What has been changed.
+        restarts: Number of restarts.
+        usable: Whether there is any odometry at all; if not, the poses are all the first.
+    """
+
+    poses: np.ndarray
+    is_stale: np.ndarray
+    notes: tuple[str, ...]
+    restarts: int = 0
+    usable: bool = True
+
+
+def check_odometry(times: np.ndarray, poses: np.ndarray) -> CheckedOdometry:
+    """Check a stream of poses and correct what can be corrected.
+
+    Args:
+        times: (N,) [s], for the duration of the steps.
+        poses: (N, 3) [m, m, rad] by odometry, in the order in which they were driven.
+
+    Returns:
+        The odometry; `poses` itself if nothing is wrong.
+    """
+    if is_frozen(poses):
+        return _no_odometry(poses, f"its pose is the same in all {len(poses)}")
+    is_jump = odometry_jumps(times, poses) | _restarts(poses)
+    restarts = int(is_jump.sum())
+    if restarts > MAX_BROKEN_FRACTION * len(poses) and restarts > 1:
+        return _no_odometry(poses, f"it jumps {restarts} times in {len(poses)} poses")
+    notes = []
+    if restarts:
+        poses = _without(is_jump, poses)
+        notes.append(f"odometry restarts ({restarts} x): no motion is assumed there")
+    poses, latched, num_latched = share_latched(times, poses)
+    if num_latched:
+        notes.append(
+            f"odometry is late ({num_latched} x): it repeats a pose and then leaps; the leap is "
+            "shared out over the time since"
+        )
+    is_stale = latched
+    is_stale[1:] |= is_jump
+    return CheckedOdometry(poses, is_stale, tuple(notes), restarts)
+
+
+def missing_spans(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Find spans without odometry in which the robot moved.
+
+    Args:
+        times: (N,) [s], ascending.
+        poses: (N, 3) [m, m, rad] by odometry.
+
+    Returns:
+        (N - 1,) bool: the step takes longer than `MAX_GAP` and far longer than the others.
+    """
+    steps = np.diff(times)
+    motion = relative(poses[:-1], poses[1:])
+    size = np.hypot(motion[:, 0], motion[:, 1]) + 0.5 * np.abs(motion[:, 2])
+    usual = float(np.median(steps)) if steps.size else 0.0
+    return (steps > max(MAX_GAP, MAX_GAP_RATIO * usual)) & (size > MIN_GAP_MOTION)
+
+
+def is_frozen(poses: np.ndarray) -> bool:
+    """Whether poses (N, 3) never change, or, from `MIN_POSES` on, hardly."""
+    if len(poses) < 2:
+        return False
+    extent = np.ptp(np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]), axis=0)
+    return bool(not extent.any() or (len(poses) >= MIN_POSES and (extent < MIN_EXTENT).all()))
+
+
+def odometry_jumps(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Find steps that are too large for a robot.
+
+    Args:
+        times: (N,) [s].
+        poses: (N, 3) [m, m, rad] by odometry.
+
+    Returns:
+        (N - 1,) bool: the step is larger than `MAX_STEP` + `MAX_SPEED` * its duration.
+    """
+    motion = relative(poses[:-1], poses[1:])
+    size = np.column_stack([np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])])
+    return (size > MAX_STEP + MAX_SPEED * np.abs(np.diff(times))[:, None]).any(axis=1)
+
+
+def share_latched(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Share out leaps over the poses that were repeated before them.
+
+    Latched are at most `MAX_LATCHED` repetitions of a pose, amid motion, before a step in the
+    direction of those beside it that is larger and faster than these by `LEAP_RATIO`, but not when
+    it is shared out. What was driven meanwhile is known from the leap as a whole: it is shared out
+    by time. These increments are a first guess for a search; they are marked, because they were
+    not measured.
+
+    Args:
+        times: (N,) [s].
+        poses: (N, 3) [m, m, rad] by odometry.
+
+    Returns:
+        The poses, (N,) bool whether the increment to a pose was shared out, and the number of
+        leaps.
+    """
+    steps = relative(poses[:-1], poses[1:])
+    size = np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
+    duration = np.maximum(np.abs(np.diff(times)), 1e-6)
+    is_zero = size < 1e-9
+    moving = np.flatnonzero(~is_zero)
+    shared, is_shared, count = poses, np.zeros(len(poses), bool), 0
+    for place in range(1, len(moving) - 1):
+        before, leap = int(moving[place - 1]), int(moving[place])  # steps that moved
+        repeats = leap - before - 1
+        if not 1 <= repeats <= MAX_LATCHED or size[leap] < MIN_LEAP:
+            continue
+        beside = np.concatenate(
+            [moving[max(place - NEIGHBOURS, 0) : place], moving[place + 1 :][:NEIGHBOURS]]
+        )
+        usual_speed = size[beside].sum() / duration[beside].sum()
+        shared_speed = size[leap] / duration[before + 1 : leap + 1].sum()
+        if (
+            size[leap] <= LEAP_RATIO * np.median(size[beside])
+            or size[leap] <= LEAP_RATIO * usual_speed * duration[leap]
+            or shared_speed > MAX_SHARED_RATIO * usual_speed
+            or np.dot(steps[leap], steps[beside].sum(axis=0)) <= 0.0
+        ):
+            continue
+        first, last = before + 1, leap + 1  # poses that the leap is shared out between
+        ends = np.sort(times[[first, last]])
+        if ends[0] < ends[1]:
+            if shared is poses:
+                shared = poses.copy()
+            inner = times[first:last].clip(*ends)
+            shared[first:last] = interpolate_poses(inner, ends, poses[[first, last]])
+        is_shared[first + 1 : last + 1] = True
+        count += 1
+    return shared, is_shared, count
+
+
+def poses_are_corrected(
+    times: np.ndarray, poses: np.ndarray, wheel_times: np.ndarray, wheel_poses: np.ndarray
+) -> bool:
+    """Whether the poses of scans differ from the odometry: another program corrected them.
+
+    A constant offset is allowed: a scanner that is not at the centre of the robot. Compared is the
+    90 % quantile of the deviation from the median offset, with `SAME_FRAME_SPREAD`.
+
+    Args:
+        times: (T,) of the scans, [s] or places in the file.
+        poses: (T, 3) [m, m, rad] of the scans.
+        wheel_times: (N,) of the odometry, on the same axis and ascending.
+        wheel_poses: (N, 3) [m, m, rad] of the odometry.
+    """
+    inside = (times >= wheel_times[0]) & (times <= wheel_times[-1])
+    if len(wheel_times) < 2 or inside.mean() < MIN_OVERLAP:
+        return False
+    odometry = interpolate_poses(times[inside], wheel_times, wheel_poses)
+    offset = relative(odometry, poses[inside])
+    offset = relative(offset[0], offset)
+    deviation = np.abs(offset - np.median(offset, axis=0))
+    distance = np.hypot(deviation[:, 0], deviation[:, 1])
+    spread = np.quantile(distance, 0.9), np.quantile(deviation[:, 2], 0.9)
+    return bool((spread > SAME_FRAME_SPREAD).any())
+
+
+def _no_odometry(poses: np.ndarray, reason: str) -> CheckedOdometry:
+    """Poses that stand still, with the reason."""
+    still = np.repeat(poses[:1], len(poses), axis=0)
+    note = f"no odometry: {reason}"
+    return CheckedOdometry(still, np.ones(len(poses), bool), (note,), usable=False)
+
+
+def _restarts(poses: np.ndarray) -> np.ndarray:
+    """Steps (N - 1,) bool to where the odometry began, far larger than all others but a few."""
+    steps = relative(poses[:-1], poses[1:])
+    size = np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
+    if len(size) < MIN_POSES:
+        return np.zeros(len(size), bool)
+    usual = float(np.quantile(size, 0.95))
+    start = relative(np.broadcast_to(poses[0], poses[1:].shape), poses[1:])
+    from_start = np.hypot(start[:, 0], start[:, 1]) + 0.5 * np.abs(start[:, 2])
+    from_zero = np.hypot(poses[1:, 0], poses[1:, 1]) + 0.5 * np.abs(poses[1:, 2])
+    at_start = np.minimum(from_start, from_zero) <= usual
+    return at_start & (size > 10.0 * usual) & (size > 0.1)
+
+
+def _without(is_jump: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses (N, 3) from the first on, with no motion in the steps (N - 1,) that are jumps."""
+    increments = relative(poses[:-1], poses[1:])
+    increments[is_jump] = 0.0
+    return np.concatenate([poses[:1], dead_reckoning(poses[0], increments)])

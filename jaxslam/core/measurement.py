@@ -19,6 +19,9 @@ class ScanMatch(NamedTuple):
     increment: Array
     information: Array
     inlier_fraction: Array
+    expected: Array | None = None
+    wheel_trust: Array | None = None
+    searched: Array | None = None
 
 
 class Measurement(NamedTuple):

@@ -144,11 +144,14 @@ def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any
 def as_scan_match(name: str, scan_match: ScanMatch, lead: tuple[int, ...], dtype: Any) -> ScanMatch:
     """Results of scan matching that lead with `lead`, checked and converted as `as_features`."""
     _check_record(name, scan_match, ScanMatch)
-    increment, information, inlier_fraction = scan_match
+    increment, information, inlier_fraction, expected, trust, searched = scan_match
     return ScanMatch(
         _floats(f"{name}.increment", increment, (*lead, 3), dtype),
         _floats(f"{name}.information", information, (*lead, 3, 3), dtype),
         _floats(f"{name}.inlier_fraction", inlier_fraction, lead, dtype),
+        None if expected is None else _floats(f"{name}.expected", expected, (*lead, 3), dtype),
+        None if trust is None else _floats(f"{name}.wheel_trust", trust, lead, dtype),
+        None if searched is None else jnp.asarray(searched),
     )
 
 

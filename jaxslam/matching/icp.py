@@ -29,6 +29,7 @@ from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
 from jaxslam.core.types import Array
+from jaxslam.matching.correlative import CorrelativeSpec
 from jaxslam.matching.oriented_points import OrientedPoints
 
 FAR_AWAY = 1e6
@@ -74,6 +75,27 @@ class ScanMatchSpec(NamedTuple):
     point_std: float = 0.1
     odometry_std_floor: tuple[float, float] = (0.05, 0.1)
     odometry_slip: tuple[float, float] = (0.1, 1.0)
+    motion_std: tuple[float, float] = (0.2, 0.3)
+    max_inlier_drop: float = 0.1
+    min_gain: float = 0.03
+    use_odometry: bool = True
+    search: CorrelativeSpec = CorrelativeSpec()
+
+
+class MotionHistory(NamedTuple):
+    """What is remembered of the motion and of the matches, from scan to scan.
+
+    Attributes:
+        increment: (3,) [m, m, rad] the last increment.
+        usual_change: (2,) [m], [rad] running mean of its change from scan to scan.
+        distrust: () 0 to 1, how often of late the wheels contradicted the scans.
+        usual_inliers: () running mean of the inlier fraction.
+    """
+
+    increment: Array
+    usual_change: Array
+    distrust: Array
+    usual_inliers: Array
 
 
 class Submap(NamedTuple):
@@ -90,6 +112,7 @@ class Submap(NamedTuple):
     poses: Array
     num_added: Array
     last_pose: Array
+    motion: "MotionHistory"
 
 
 class PosePrior(NamedTuple):

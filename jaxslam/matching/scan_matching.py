@@ -28,8 +28,10 @@ from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
-from jaxslam.matching import checks
+from jaxslam.matching import checks, correlative
 from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
+from jaxslam.matching.motion_prior import contradicts, difference, expected_motion, first_history, is_leap, next_history
+from jaxslam.matching.mount import mount_variance
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
 
 TURN_PENALTY = 0.005
@@ -51,7 +53,7 @@ def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
     nothing = OrientedPoints(
         jnp.zeros((*size, 2)), jnp.zeros((*size, 2)), jnp.zeros(size), jnp.zeros(size, bool)
     )
-    return Submap(nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3))
+    return Submap(nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3), first_history())
 
 
 def match_scan(
@@ -142,14 +144,32 @@ def fuse_odometry(
     """
     information = scan_match.information / std_scale**2
     floor = jnp.array([FUSION_STD_FLOOR[0], FUSION_STD_FLOOR[0], FUSION_STD_FLOOR[1]]) ** 2
-    odometry_root = inverse_cholesky(odometry_cov + jnp.diag(floor))[0]
-    cov_root = inverse_cholesky(odometry_root.T @ odometry_root + information)[0]
-    cov = cov_root.T @ cov_root
+    floor = jnp.diag(floor) + mount_variance(odometry)
+    if scan_match.expected is not None:
+        odometry = scan_match.expected
+        distrust = 1.0 - scan_match.wheel_trust
+        odometry_cov = odometry_cov + distrust * jnp.diag(jnp.array([0.2, 0.2, 0.3]) ** 2)
     innovation = scan_match.increment - odometry
     innovation = innovation.at[2].set(wrap_angle(innovation[2]))
+    odometry_root = inverse_cholesky(odometry_cov + floor)[0]
+    by_odometry = odometry_root.T @ odometry_root
+    weight = _odometry_weight(by_odometry, information, innovation)
+    cov_root = inverse_cholesky(weight * by_odometry + information)[0]
+    cov = cov_root.T @ cov_root
     matched = jnp.any(scan_match.information != 0.0)
     increment = odometry + cov @ (information @ innovation)
     return jnp.where(matched, increment, odometry), jnp.where(matched, cov, odometry_cov)
+
+
+def _odometry_weight(odometry_information: Array, information: Array, innovation: Array) -> Array:
+    """Weight () of odometry, by a Student t distribution of 3 degrees of freedom.
+
+    d^2 = e^T (Q + H^-1)^-1 e, where (Q + H^-1)^-1 = H - H (Q^-1 + H)^-1 H also for a singular H.
+    """
+    root = inverse_cholesky(odometry_information + information)[0]
+    pull = information @ innovation
+    square = innovation @ pull - jnp.sum((root @ pull) ** 2)
+    return jnp.minimum(1.0, 6.0 / (3.0 + jnp.maximum(square, 0.0)))
 
 
 def _match_scan(
@@ -158,16 +178,52 @@ def _match_scan(
     """`match_scan` of what has been checked."""
     every = -(-lidar.num_beams // spec.max_beams)
     points, hit = beam_ends(lidar, scan)[::every], scan.hit[::every]
-    predicted = compose(submap.last_pose, odometry)
-    moved = jnp.stack([jnp.hypot(odometry[0], odometry[1]), jnp.abs(odometry[2])])
-    variance = (
-        jnp.array(spec.odometry_std_floor) ** 2 + (jnp.array(spec.odometry_slip) * moved) ** 2
-    )
-    odometry_information = jnp.diag(1.0 / jnp.stack([variance[0], variance[0], variance[1]]))
-    prior = PosePrior(predicted, odometry_information)
+    history, before = submap.motion, submap.last_pose
+    motion = expected_motion(spec, history, odometry, history.distrust)
+    prior = PosePrior(compose(before, motion.increment), jnp.diag(motion.information))
 
-    start = _best_start(spec, lidar, submap, prior, variance[1], points, hit)
-    pose, information, inlier_fraction = icp(
+    start = _best_start(spec, lidar, submap, prior, 1.0 / motion.information[2], points, hit)
+    quick = _refine(spec, lidar, submap, prior, start, points, hit)
+    found = relative(before, quick[0])
+    little = quick[2] < history.usual_inliers - spec.max_inlier_drop
+    leap = is_leap(history, odometry)
+    contra = contradicts(spec, odometry, found)
+    odd = (little | leap | contra) & (submap.num_added > 0)
+    wide = partial(_search, spec, lidar, submap, odometry, points, hit, quick)
+    pose, information, inlier_fraction = lax.cond(odd, wide, lambda: quick)
+    finite = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
+    pose, information = jnp.where(finite, pose, prior.pose), jnp.where(finite, information, 0.0)
+    pose = pose.at[2].set(wrap_angle(pose[2]))
+    # From the frame of the pose before.
+    turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))
+    increment = relative(before, pose)
+    contradicted = contradicts(spec, odometry, increment)
+    believed = expected_motion(
+        spec, history, odometry, jnp.maximum(history.distrust, contradicted)
+    )
+    match = ScanMatch(
+        increment,
+        turn.T @ information @ turn,
+        inlier_fraction,
+        believed.increment,
+        believed.trust,
+        jnp.stack([odd, little, leap, contra, quick[2]]),
+    )
+    history = next_history(history, increment, inlier_fraction, contradicted)
+    return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), match
+
+
+def _refine(
+    spec: ScanMatchSpec,
+    lidar: Lidar,
+    submap: Submap,
+    prior: PosePrior,
+    start: Array,
+    points: Array,
+    hit: Array,
+) -> tuple[Array, Array, Array]:
+    """ICP of all points to all keyframes, with close correspondences."""
+    return icp(
         spec,
         lidar,
         submap,
@@ -178,14 +234,49 @@ def _match_scan(
         gates=spec.fine_gates,
         kernel_scale=spec.kernel_scales[1],
     )
-    finite = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
-    pose, information = jnp.where(finite, pose, predicted), jnp.where(finite, information, 0.0)
-    pose = pose.at[2].set(wrap_angle(pose[2]))
-    # From the frame of the pose before.
-    turn = jnp.eye(3).at[:2, :2].set(rotation(submap.last_pose[2]))
-    increment = relative(submap.last_pose, pose)
-    match = ScanMatch(increment, turn.T @ information @ turn, inlier_fraction)
-    return _add_keyframe(spec, lidar, submap, scan, pose), match
+
+
+def _search(
+    spec: ScanMatchSpec,
+    lidar: Lidar,
+    submap: Submap,
+    odometry: Array,
+    points: Array,
+    hit: Array,
+    quick: tuple[Array, Array, Array],
+) -> tuple[Array, Array, Array]:
+    """The best of the quick match and of the candidates of a wide correlative search."""
+    before, last = submap.last_pose, submap.motion.increment
+    expected = jnp.stack([compose(before, odometry), compose(before, last)])
+    middle = compose(before, odometry + difference(odometry, last) / 2)
+    surfaces = submap.oriented_points
+    candidates = correlative.search(
+        spec.search, surfaces.points.reshape(-1, 2), surfaces.valid.ravel(), middle, expected, points, hit
+    ).poses
+    std = jnp.array([spec.motion_std[0], spec.motion_std[0], spec.motion_std[1]])
+    thinned = slice(None, None, spec.coarse_stride)
+
+    def follow(start: Array) -> tuple[Array, Array]:
+        pose, _, inlier_fraction = icp(
+            spec,
+            lidar,
+            submap,
+            PosePrior(start, jnp.diag(1.0 / std**2)),
+            start,
+            points[thinned],
+            hit[thinned],
+            gates=spec.coarse_gates[2:],
+            kernel_scale=spec.kernel_scales[0],
+        )
+        return pose, inlier_fraction - correlative.surprise(spec.search, expected, pose)
+
+    poses, score = jax.vmap(follow)(candidates)
+    best = poses[jnp.argmax(score)]
+    other = _refine(spec, lidar, submap, PosePrior(best, jnp.diag(1.0 / std**2)), best, points, hit)
+    gain = other[2] - quick[2]
+    gain -= correlative.surprise(spec.search, expected, other[0])
+    gain += correlative.surprise(spec.search, expected, quick[0])
+    return jax.tree.map(partial(jnp.where, gain > spec.min_gain), other, quick)
 
 
 def _best_start(
@@ -244,6 +335,7 @@ def _add_keyframe(
         put(submap.poses, pose),
         submap.num_added + new.astype(jnp.int32),
         pose,
+        submap.motion,
     )
 
 

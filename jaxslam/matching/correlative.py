@@ -17,6 +17,7 @@ References:
     Robotics, section 6.4: likelihood fields.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -42,7 +43,8 @@ class CorrelativeSpec(NamedTuple):
         num_candidates: C, poses that are returned.
         distinct: [m], [rad] beyond which two poses are different places.
         expected_std: [m], [rad] from the nearest pose that was expected, at which
-        penalty: is subtracted from a score; it grows with the square.
+        penalty: is subtracted from a score; it grows with the square,
+        max_penalty: up to this: a robot may have been carried.
     """
 
     cell: float = 0.1
@@ -56,6 +58,7 @@ class CorrelativeSpec(NamedTuple):
     distinct: tuple[float, float] = (0.5, 0.3)
     expected_std: tuple[float, float] = (0.5, 0.75)
     penalty: float = 0.1
+    max_penalty: float = 0.4
 
 
 class Candidates(NamedTuple):
@@ -132,7 +135,7 @@ def surprise(spec: CorrelativeSpec, expected: Array, pose: Array) -> Array:
     off = pose[None] - expected
     square = (off[:, 0] ** 2 + off[:, 1] ** 2) / spec.expected_std[0] ** 2
     square = square + (wrap_angle(off[:, 2]) / spec.expected_std[1]) ** 2
-    return spec.penalty * jnp.min(square)
+    return jnp.minimum(spec.penalty * jnp.min(square), spec.max_penalty)
 
 
 def search(
@@ -164,8 +167,13 @@ def search(
     offset = spec.cell * jnp.arange(-(score.shape[1] // 2), score.shape[1] // 2 + 1.0)
     headings = _headings(spec, field.dtype)
     expected = jax.vmap(relative, in_axes=(None, 0))(guess, expected)
-    by_pose = jax.vmap(jax.vmap(jax.vmap(lambda k, x, y: surprise(spec, expected, jnp.stack([x, y, k])), in_axes=(None, None, 0)), in_axes=(None, 0, None)), in_axes=(0, None, None))
-    score = score - by_pose(headings, offset, offset)
+    grid = jnp.stack(
+        jnp.broadcast_arrays(offset[None, :, None], offset[None, None], headings[:, None, None]),
+        axis=-1,
+    )
+    score = score - jax.vmap(partial(surprise, spec, expected))(grid.reshape(-1, 3)).reshape(
+        score.shape
+    )
 
     def take(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.argmax(left)

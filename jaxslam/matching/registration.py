@@ -141,9 +141,7 @@ def register_scan(
 
     surfaces = jax.vmap(partial(oriented_points, lidar))(submap_scans)
     surfaces = jax.vmap(transform_points)(submap_poses, surfaces)
-    submap = Submap(
-        surfaces, submap_poses, jnp.int32(spec.submap_scans), guess, first_history()
-    )
+    submap = Submap(surfaces, submap_poses, jnp.int32(spec.submap_scans), guess, first_history())
     every = -(-lidar.num_beams // scan_matching.max_beams)
     points, hit = beam_ends(lidar, scan)[::every], scan.hit[::every]
     std = jnp.array([spec.guess_std[0], spec.guess_std[0], spec.guess_std[1]])

@@ -4,7 +4,12 @@ The submap holds the points of the last keyframe scans, with the normals of the 
 on. A scan is registered where its points are on these surfaces. ICP starts from several headings
 around that of the odometry, as wheels slip most where a robot turns. The odometry is also a weak
 prior, which keeps directions that the scans do not constrain, such as along a bare corridor.
-The information returned with each increment is that of the scans alone; `fuse_odometry` combines
+
+Wheels may be wrong by far more than that: they slip, hang, or repeat old values. Where this quick
+match explains less of the scan than usual, contradicts the wheels, or the wheels leap, `wide_search`
+looks further. Wheels that are contradicted again and again are trusted less (`motion_prior`); with
+`use_odometry=False` they are not used at all.
+The information returned with each increment is that of the scans alone; `odometry_fusion` combines
 both. `icp` has the formulas.
 
     submap = empty_submap(spec, lidar)
@@ -22,23 +27,26 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.core import trace_cache
-from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
-from jaxslam.matching import checks, correlative
+from jaxslam.matching import checks
 from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
-from jaxslam.matching.motion_prior import contradicts, difference, expected_motion, first_history, is_leap, next_history
-from jaxslam.matching.mount import mount_variance
+from jaxslam.matching.motion_prior import (
+    change_variance,
+    contradicts,
+    expected_motion,
+    first_history,
+    is_leap,
+    next_history,
+)
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
+from jaxslam.matching.wide_search import fine_icp, search_widely
 
 TURN_PENALTY = 0.005
 """Inlier fraction that a heading 1 std off the odometry must have in addition."""
-
-FUSION_STD_FLOOR = (0.01, 0.005)
-"""[m], [rad] least std of odometry where it is fused with scans."""
 
 
 def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
@@ -53,7 +61,9 @@ def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
     nothing = OrientedPoints(
         jnp.zeros((*size, 2)), jnp.zeros((*size, 2)), jnp.zeros(size), jnp.zeros(size, bool)
     )
-    return Submap(nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3), first_history())
+    return Submap(
+        nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3), first_history()
+    )
 
 
 def match_scan(
@@ -61,12 +71,15 @@ def match_scan(
 ) -> tuple[Submap, ScanMatch]:
     """Match one scan, coarse to fine, and add it to the submap if it is a keyframe.
 
-        1. Predict the pose by odometry; its std grows with the motion, by `spec.odometry_slip`.
+        1. Predict the pose by odometry, as far as it is trusted; its std grows with the motion, by
+           `spec.odometry_slip`.
         2. Coarse search: ICP from each of `spec.heading_guesses`, of few points to recent
            keyframes.
         3. Keep the start of the largest inlier fraction, less a penalty on its turn.
         4. Refine: ICP of all points to all keyframes, with closer correspondences.
-        5. If that is not finite, the predicted pose and no information.
+        5. If this explains little, or contradicts the wheels, search a wide window as well. Under
+           `jax.vmap` that is computed for every scan, whether needed or not.
+        6. If the result is not finite, the predicted pose and no information.
 
     It is one step, for robots online: call it by `jax.jit(match_scan, static_argnums=(0, 1))`.
 
@@ -126,157 +139,49 @@ def match_scans(
     return _match_scans(spec, lidar, submap, scans, odometry, count)
 
 
-def fuse_odometry(
-    std_scale: Array, odometry: Array, odometry_cov: Array, scan_match: ScanMatch
-) -> tuple[Array, Array]:
-    """Increment (3,) by odometry and scan matching together, and its covariance (3, 3).
-
-    A Kalman update in information form: cov = (Q^-1 + H / std_scale^2)^-1, with the covariance Q
-    of the odometry and the information H of the scan. Without any, odometry and its covariance
-    are returned as they are.
-
-    Args:
-        std_scale: () factor on the standard deviation of scan matching.
-        odometry: (3,) [m, m, rad] odometry increment.
-        odometry_cov: (3, 3) its covariance; `FUSION_STD_FLOOR` is added where there is something
-            to fuse it with.
-        scan_match: Result of scan matching.
-    """
-    information = scan_match.information / std_scale**2
-    floor = jnp.array([FUSION_STD_FLOOR[0], FUSION_STD_FLOOR[0], FUSION_STD_FLOOR[1]]) ** 2
-    floor = jnp.diag(floor) + mount_variance(odometry)
-    if scan_match.expected is not None:
-        odometry = scan_match.expected
-        distrust = 1.0 - scan_match.wheel_trust
-        odometry_cov = odometry_cov + distrust * jnp.diag(jnp.array([0.2, 0.2, 0.3]) ** 2)
-    innovation = scan_match.increment - odometry
-    innovation = innovation.at[2].set(wrap_angle(innovation[2]))
-    odometry_root = inverse_cholesky(odometry_cov + floor)[0]
-    by_odometry = odometry_root.T @ odometry_root
-    weight = _odometry_weight(by_odometry, information, innovation)
-    cov_root = inverse_cholesky(weight * by_odometry + information)[0]
-    cov = cov_root.T @ cov_root
-    matched = jnp.any(scan_match.information != 0.0)
-    increment = odometry + cov @ (information @ innovation)
-    return jnp.where(matched, increment, odometry), jnp.where(matched, cov, odometry_cov)
-
-
-def _odometry_weight(odometry_information: Array, information: Array, innovation: Array) -> Array:
-    """Weight () of odometry, by a Student t distribution of 3 degrees of freedom.
-
-    d^2 = e^T (Q + H^-1)^-1 e, where (Q + H^-1)^-1 = H - H (Q^-1 + H)^-1 H also for a singular H.
-    """
-    root = inverse_cholesky(odometry_information + information)[0]
-    pull = information @ innovation
-    square = innovation @ pull - jnp.sum((root @ pull) ** 2)
-    return jnp.minimum(1.0, 6.0 / (3.0 + jnp.maximum(square, 0.0)))
-
-
 def _match_scan(
     spec: ScanMatchSpec, lidar: Lidar, submap: Submap, scan: Scan, odometry: Array
 ) -> tuple[Submap, ScanMatch]:
     """`match_scan` of what has been checked."""
     every = -(-lidar.num_beams // spec.max_beams)
     points, hit = beam_ends(lidar, scan)[::every], scan.hit[::every]
-    history, before = submap.motion, submap.last_pose
+    before, history = submap.last_pose, submap.motion
+    if not spec.use_odometry:
+        odometry = history.increment
     motion = expected_motion(spec, history, odometry, history.distrust)
     prior = PosePrior(compose(before, motion.increment), jnp.diag(motion.information))
 
     start = _best_start(spec, lidar, submap, prior, 1.0 / motion.information[2], points, hit)
-    quick = _refine(spec, lidar, submap, prior, start, points, hit)
-    found = relative(before, quick[0])
-    little = quick[2] < history.usual_inliers - spec.max_inlier_drop
-    leap = is_leap(history, odometry)
-    contra = contradicts(spec, odometry, found)
-    odd = (little | leap | contra) & (submap.num_added > 0)
-    wide = partial(_search, spec, lidar, submap, odometry, points, hit, quick)
-    pose, information, inlier_fraction = lax.cond(odd, wide, lambda: quick)
-    finite = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
-    pose, information = jnp.where(finite, pose, prior.pose), jnp.where(finite, information, 0.0)
+    quick = fine_icp(spec, lidar, submap, prior, start, points, hit)
+    explains_little = quick.inlier_fraction < history.usual_inliers - spec.max_inlier_drop
+    odd = explains_little | is_leap(history, odometry)
+    odd |= contradicts(spec, odometry, relative(before, quick.pose))
+    match = lax.cond(
+        odd & (submap.num_added > 0),
+        partial(search_widely, spec, lidar, submap, odometry, points, hit),
+        lambda quick: quick,
+        quick,
+    )
+    finite = jnp.all(jnp.isfinite(match.pose)) & jnp.all(jnp.isfinite(match.information))
+    pose = jnp.where(finite, match.pose, prior.pose)
     pose = pose.at[2].set(wrap_angle(pose[2]))
+    information = jnp.where(finite, match.information, 0.0)
     # From the frame of the pose before.
     turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))
     increment = relative(before, pose)
     contradicted = contradicts(spec, odometry, increment)
-    believed = expected_motion(
-        spec, history, odometry, jnp.maximum(history.distrust, contradicted)
-    )
-    match = ScanMatch(
+    distrust = jnp.maximum(history.distrust, contradicted)
+    expected = expected_motion(spec, history, odometry, distrust)
+    result = ScanMatch(
         increment,
         turn.T @ information @ turn,
-        inlier_fraction,
-        believed.increment,
-        believed.trust,
-        jnp.stack([odd, little, leap, contra, quick[2]]),
+        match.inlier_fraction,
+        expected.increment,
+        (1.0 - expected.odometry_weight) * change_variance(history),
+        expected.odometry_weight,
     )
-    history = next_history(history, increment, inlier_fraction, contradicted)
-    return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), match
-
-
-def _refine(
-    spec: ScanMatchSpec,
-    lidar: Lidar,
-    submap: Submap,
-    prior: PosePrior,
-    start: Array,
-    points: Array,
-    hit: Array,
-) -> tuple[Array, Array, Array]:
-    """ICP of all points to all keyframes, with close correspondences."""
-    return icp(
-        spec,
-        lidar,
-        submap,
-        prior,
-        start,
-        points,
-        hit,
-        gates=spec.fine_gates,
-        kernel_scale=spec.kernel_scales[1],
-    )
-
-
-def _search(
-    spec: ScanMatchSpec,
-    lidar: Lidar,
-    submap: Submap,
-    odometry: Array,
-    points: Array,
-    hit: Array,
-    quick: tuple[Array, Array, Array],
-) -> tuple[Array, Array, Array]:
-    """The best of the quick match and of the candidates of a wide correlative search."""
-    before, last = submap.last_pose, submap.motion.increment
-    expected = jnp.stack([compose(before, odometry), compose(before, last)])
-    middle = compose(before, odometry + difference(odometry, last) / 2)
-    surfaces = submap.oriented_points
-    candidates = correlative.search(
-        spec.search, surfaces.points.reshape(-1, 2), surfaces.valid.ravel(), middle, expected, points, hit
-    ).poses
-    std = jnp.array([spec.motion_std[0], spec.motion_std[0], spec.motion_std[1]])
-    thinned = slice(None, None, spec.coarse_stride)
-
-    def follow(start: Array) -> tuple[Array, Array]:
-        pose, _, inlier_fraction = icp(
-            spec,
-            lidar,
-            submap,
-            PosePrior(start, jnp.diag(1.0 / std**2)),
-            start,
-            points[thinned],
-            hit[thinned],
-            gates=spec.coarse_gates[2:],
-            kernel_scale=spec.kernel_scales[0],
-        )
-        return pose, inlier_fraction - correlative.surprise(spec.search, expected, pose)
-
-    poses, score = jax.vmap(follow)(candidates)
-    best = poses[jnp.argmax(score)]
-    other = _refine(spec, lidar, submap, PosePrior(best, jnp.diag(1.0 / std**2)), best, points, hit)
-    gain = other[2] - quick[2]
-    gain -= correlative.surprise(spec.search, expected, other[0])
-    gain += correlative.surprise(spec.search, expected, quick[0])
-    return jax.tree.map(partial(jnp.where, gain > spec.min_gain), other, quick)
+    history = next_history(history, increment, match.inlier_fraction, contradicted)
+    return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), result
 
 
 def _best_start(

@@ -21,8 +21,11 @@ SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
     "increment": (3,),
     "information": (3, 3),
     "inlier_fraction": (),
+    "expected": (3,),
+    "expected_variance": (3,),
+    "odometry_weight": (),
 }
-"""Sizes after B and T of each field of `ScanMatch`, in its order; all are floats."""
+"""Sizes after B and T of each field of `ScanMatch`, in its order; all are floats, or None."""
 
 
 def prepare(
@@ -123,7 +126,9 @@ def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") ->
         check_type(f"{name}.scan_matches", matches, ScanMatch)
         matches = ScanMatch(
             *(
-                _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
+                x
+                if x is None
+                else _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
                 for (field, sizes), x in zip(SCAN_MATCH_FIELDS.items(), matches, strict=True)
             )
         )

@@ -45,7 +45,7 @@ def run(
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")],
     reference: OptionalFile = None,
     relations: OptionalFile = None,
-    odometry: Literal["scan", "wheels"] = "scan",
+    odometry: Literal["scan", "scans-only", "wheels"] = "scan",
     smooth: bool = True,
     noise: OptionalFile = None,
     scan_topic: OptionalTopic = None,
@@ -70,7 +70,8 @@ def run(
             that the extra [data] installs.
         reference: Reference trajectory to evaluate with: a TUM file with the log's clock.
         relations: Verified relative poses to evaluate with, with the log's clock.
-        odometry: Scan matching fused with wheel odometry (scan), or wheel odometry alone (wheels).
+        odometry: Scan matching fused with wheel odometry (scan), scan matching alone, for logs
+            without odometry (scans-only), or wheel odometry alone (wheels).
         smooth: Batch-smooth the trajectory and landmarks, with loop closures; --no-smooth writes
             the online estimates.
         noise: File of the noise parameters of the filter (Q and R); by default cautious ones.
@@ -86,13 +87,16 @@ def run(
     laser_log = readers.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
     known = None if reference is None else tum.read(reference)
     verified = None if relations is None else relations_file.read(relations)
-    match_scans = odometry == "scan"
+    match_scans = odometry != "wheels"
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     if scan is not None:
         check_range("--scan", scan, 0, len(laser_log.times) - 1)
     odom_poses = relative(laser_log.odom_poses[0], laser_log.odom_poses)
     with name_errors(str(log)):
         config = Config.for_laser_log(laser_log.lidar)
+        if odometry == "scans-only":
+            matching = config.scan_matching._replace(use_odometry=False)
+            config = config._replace(scan_matching=matching)
         config.check()
         increments = arguments.as_log_odometry(increments_of(odom_poses))
         scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
@@ -122,7 +126,7 @@ def run(
         numbers = {
             "scans": len(result.poses),
             "skipped_lines": laser_log.num_skipped,
-            "mended": laser_log.odometry_repairs,
+            "mended": laser_log.odometry_repairs + result.notes,
             "odometry": odometry,
             "path_length_m": log_errors.path_length(result.poses if match_scans else odom_poses),
             "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
@@ -135,7 +139,7 @@ def run(
             numbers["dead_reckoning"] = dead_reckoning
         report.write_results(out_dir, numbers, laser_log.times, result)
         measurements = Measurement(
-            jnp.asarray(increments, float), result.features, scan_match=result.scan_matches
+            jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
         )
         config = config._replace(  # the map has grown to its size, which the files are made for
             filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)

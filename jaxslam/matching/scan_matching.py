@@ -6,9 +6,9 @@ around that of the odometry, as wheels slip most where a robot turns. The odomet
 prior, which keeps directions that the scans do not constrain, such as along a bare corridor.
 
 Wheels may be wrong by far more than that: they slip, hang, or repeat old values. Where this quick
-match explains less of the scan than usual, contradicts the wheels, or the wheels leap, `wide_search`
-looks further. Wheels that are contradicted again and again are trusted less (`motion_prior`); with
-`use_odometry=False` they are not used at all.
+match explains less of the scan than usual, contradicts the wheels, or the wheels leap,
+`wide_search` looks further. Wheels that are contradicted again and again are trusted less
+(`motion_prior`); with `use_odometry=False` they are not used at all.
 The information returned with each increment is that of the scans alone; `odometry_fusion` combines
 both. `icp` has the formulas.
 

@@ -58,7 +58,7 @@ class CorrelativeSpec(NamedTuple):
     distinct: tuple[float, float] = (0.5, 0.3)
     expected_std: tuple[float, float] = (0.5, 0.75)
     penalty: float = 0.1
-    max_penalty: float = 0.4
+    max_penalty: float = 0.25
 
 
 class Candidates(NamedTuple):

@@ -125,7 +125,7 @@ def window_scores(spec: CorrelativeSpec, field: Array, points: Array, hit: Array
             return total + jnp.where(counts, window, 0.0), None
 
         total, _ = lax.scan(add, jnp.zeros((size, size), field.dtype), (cell, inside))
-        return total / jnp.maximum(jnp.sum(hit), 1)
+        return total / jnp.maximum(jnp.sum(hit, dtype=field.dtype), 1.0)
 
     return lax.map(at_heading, _headings(spec, field.dtype))
 

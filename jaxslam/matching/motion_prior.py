@@ -105,10 +105,11 @@ def next_history(
     change = magnitude(difference(history.increment, increment))
     # One wrong match must not make leaps usual.
     change = jnp.clip(change, jnp.array(LEAST_CHANGE), MAX_STD * history.usual_change)
+    contradiction = contradicted.astype(increment.dtype)
     return MotionHistory(
         increment,
         MEMORY * history.usual_change + (1.0 - MEMORY) * change,
-        DISTRUST_MEMORY * history.distrust + (1.0 - DISTRUST_MEMORY) * contradicted,
+        DISTRUST_MEMORY * history.distrust + (1.0 - DISTRUST_MEMORY) * contradiction,
         MEMORY * history.usual_inliers + (1.0 - MEMORY) * inlier_fraction,
     )
 

@@ -170,7 +170,7 @@ def _match_scan(
     turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))
     increment = relative(before, pose)
     contradicted = contradicts(spec, odometry, increment)
-    distrust = jnp.maximum(history.distrust, contradicted)
+    distrust = jnp.where(contradicted, 1.0, history.distrust)
     expected = expected_motion(spec, history, odometry, distrust)
     result = ScanMatch(
         increment,

@@ -47,16 +47,15 @@ def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, int]
         Increments (T, 3) with the same poses after each leap, and the number of leaps.
     """
     size = np.hypot(odometry[:, 0], odometry[:, 1]) + HEADING_WEIGHT * np.abs(odometry[:, 2])
-    moves = size > 1e-6
-    moving = np.flatnonzero(moves)
+    moving = [int(k) for k in np.flatnonzero(size > 1e-6)]
     shared, num_leaps = odometry.copy(), 0
     for at, leap in enumerate(moving):
         first = moving[at - 1] + 1 if at else 1
         count = leap - first + 1
         if not 2 <= count <= MAX_LATCHED + 1:
             continue
-        around = np.r_[moving[max(at - NEIGHBOURS, 0) : at], moving[at + 1 : at + 1 + NEIGHBOURS]]
-        usual = np.median(size[around]) if len(around) else np.inf
+        around = moving[max(at - NEIGHBOURS, 0) : at] + moving[at + 1 : at + 1 + NEIGHBOURS]
+        usual = np.median(size[around]) if around else np.inf
         if size[leap] < MIN_SHARE * count * usual:
             continue
         too_large = size[leap] > MIN_LEAP * usual

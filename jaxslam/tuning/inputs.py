@@ -25,7 +25,7 @@ SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
     "expected_variance": (3,),
     "odometry_weight": (),
 }
-"""Sizes after B and T of each field of `ScanMatch`, in its order; all are floats, or None."""
+"""Sizes after B and T of each field of `ScanMatch`; all are floats, the last three perhaps None."""
 
 
 def prepare(
@@ -124,13 +124,13 @@ def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") ->
     matches = episodes.scan_matches
     if matches is not None:
         check_type(f"{name}.scan_matches", matches, ScanMatch)
+        given = matches._asdict()
         matches = ScanMatch(
-            *(
-                x
-                if x is None
-                else _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
-                for (field, sizes), x in zip(SCAN_MATCH_FIELDS.items(), matches, strict=True)
-            )
+            **{
+                field: _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
+                for field, sizes in SCAN_MATCH_FIELDS.items()
+                if (x := given[field]) is not None
+            }
         )
     return Episode(
         truth=_convert(f"{name}.truth", episodes.truth, (b, t, 3), jnp.floating),

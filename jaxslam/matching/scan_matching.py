@@ -149,7 +149,9 @@ def _match_scan(
     if not spec.use_odometry:
         odometry = history.increment
     motion = expected_motion(spec, history, odometry, history.distrust)
-    prior = PosePrior(compose(before, motion.increment), jnp.diag(motion.information))
+    turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))  # from the frame of the pose before
+    information = turn @ jnp.diag(motion.information) @ turn.T
+    prior = PosePrior(compose(before, motion.increment), information)
 
     start = _best_start(spec, lidar, submap, prior, 1.0 / motion.information[2], points, hit)
     quick = fine_icp(spec, lidar, submap, prior, start, points, hit)
@@ -166,8 +168,6 @@ def _match_scan(
     pose = jnp.where(finite, match.pose, prior.pose)
     pose = pose.at[2].set(wrap_angle(pose[2]))
     information = jnp.where(finite, match.information, 0.0)
-    # From the frame of the pose before.
-    turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))
     increment = relative(before, pose)
     contradicted = contradicts(spec, odometry, increment)
     distrust = jnp.where(contradicted, 1.0, history.distrust)

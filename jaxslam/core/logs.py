@@ -35,7 +35,7 @@ class LaserLog(NamedTuple):
         notes: What was wrong with the log and has been corrected, or had to be assumed.
         has_odometry: Whether there is odometry at all; if not, its poses stand still.
         odometry_stale: (T,) bool, whether the increment of the odometry to a scan is not to be
-            trusted: it was late, lost or interpolated; None if all are to be.
+            trusted: it was lost or interpolated; None if all are to be.
         mount: (3,) [m, m, rad] pose of the scanner in the robot frame (`base_link`), as far as it
             is known; the identity if not.
     """

@@ -141,11 +141,18 @@ def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any
 def as_scan_match(name: str, scan_match: ScanMatch, lead: tuple[int, ...], dtype: Any) -> ScanMatch:
     """Results of scan matching that lead with `lead`, checked and converted as `as_features`."""
     check_type(name, scan_match, ScanMatch)
-    increment, information, inlier_fraction = scan_match
+
+    def optional(field: str, shape: tuple[int, ...]) -> Array | None:
+        x = getattr(scan_match, field)
+        return None if x is None else _floats(f"{name}.{field}", x, shape, dtype)
+
     return ScanMatch(
-        _floats(f"{name}.increment", increment, (*lead, 3), dtype),
-        _floats(f"{name}.information", information, (*lead, 3, 3), dtype),
-        _floats(f"{name}.inlier_fraction", inlier_fraction, lead, dtype),
+        _floats(f"{name}.increment", scan_match.increment, (*lead, 3), dtype),
+        _floats(f"{name}.information", scan_match.information, (*lead, 3, 3), dtype),
+        _floats(f"{name}.inlier_fraction", scan_match.inlier_fraction, lead, dtype),
+        optional("expected", (*lead, 3)),
+        optional("expected_variance", (*lead, 3)),
+        optional("odometry_weight", lead),
     )
 
 

@@ -12,7 +12,7 @@ from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering import measurement_model
 from jaxslam.filtering.motion_model import odometry_cov, wheel_coefficients
-from jaxslam.matching import scan_matching
+from jaxslam.matching import odometry_fusion
 
 
 class NoiseParams(NamedTuple):
@@ -131,6 +131,6 @@ def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Arra
         return measurement.odometry, motion_cov
     if params.scan_match_std_scale is None:
         raise ValueError("params.scan_match_std_scale is None, but measurement.scan_match is given")
-    return scan_matching.fuse_odometry(
+    return odometry_fusion.fuse_odometry(
         params.scan_match_std_scale, measurement.odometry, motion_cov, measurement.scan_match
     )

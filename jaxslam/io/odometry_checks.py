@@ -1,10 +1,10 @@
-"""Checks of a log's odometry, the same for all formats: is it there, does it restart or latch?
+"""Checks of a log's odometry, the same for all formats: is it there, does it restart?
 
 Many public logs hold poses corrected by a SLAM program in the lines of the scans, and the raw
-odometry in lines of their own; the odometry restarts at zero when a robot is switched off and on;
-a driver that is late gives several scans the same pose, and then leaps to the right one.
+odometry in lines of their own; and the odometry restarts at zero when a robot is switched off and
+on.
 
-A robot that reports driving backwards as driving forwards is found by scan matching alone.
+Odometry that latches, or reports driving backwards as driving forwards, is found by scan matching.
 """
 
 from typing import NamedTuple
@@ -22,11 +22,6 @@ SAME_FRAME_SPREAD = np.array([0.3, 0.1])  # [m], [rad] tolerance of `poses_are_c
 MIN_OVERLAP = 0.9  # least fraction of the scans within the time of the odometry, for a comparison
 MIN_EXTENT = np.array([0.01, 0.01, 0.02])  # [m, m, rad] that an odometry which works exceeds
 MIN_POSES = 10  # fewer may have that little extent
-MAX_LATCHED = 4  # repetitions of a pose by a late driver; after more, the robot stood still
-LEAP_RATIO = 1.5  # of size and speed of a leap after latched poses, over those beside it
-MAX_SHARED_RATIO = 2.0  # of the speed of a leap that is shared out, over the speed beside it
-MIN_LEAP = 0.02  # [m] of such a leap; a radian counts as half a metre
-NEIGHBOURS = 5  # steps on either side that the usual speed is taken from
 MAX_GAP = 3.5  # [s] without odometry that needs no note
 MAX_GAP_RATIO = 20.0  # of such a gap over the usual step
 MIN_GAP_MOTION = 0.3  # [m] in such a gap; a radian counts as half a metre
@@ -71,14 +66,7 @@ def check_odometry(times: np.ndarray, poses: np.ndarray) -> CheckedOdometry:
     if restarts:
         poses = _without(is_jump, poses)
         notes.append(f"odometry restarts ({restarts} x): no motion is assumed there")
-    poses, latched, num_latched = share_latched(times, poses)
-    if num_latched:
-        notes.append(
-            f"odometry is late ({num_latched} x): it repeats a pose and then leaps; the leap is "
-            "shared out over the time since"
-        )
-    is_stale = latched
-    is_stale[1:] |= is_jump
+    is_stale = np.concatenate([[False], is_jump])
     return CheckedOdometry(poses, is_stale, tuple(notes), restarts)
 
 
@@ -120,58 +108,6 @@ def odometry_jumps(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
     motion = relative(poses[:-1], poses[1:])
     size = np.column_stack([np.hypot(motion[:, 0], motion[:, 1]), np.abs(motion[:, 2])])
     return (size > MAX_STEP + MAX_SPEED * np.abs(np.diff(times))[:, None]).any(axis=1)
-
-
-def share_latched(times: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Share out leaps over the poses that were repeated before them.
-
-    Latched are at most `MAX_LATCHED` repetitions of a pose, amid motion, before a step in the
-    direction of those beside it that is larger and faster than these by `LEAP_RATIO`, but not when
-    it is shared out. What was driven meanwhile is known from the leap as a whole: it is shared out
-    by time. These increments are a first guess for a search; they are marked, because they were
-    not measured.
-
-    Args:
-        times: (N,) [s].
-        poses: (N, 3) [m, m, rad] by odometry.
-
-    Returns:
-        The poses, (N,) bool whether the increment to a pose was shared out, and the number of
-        leaps.
-    """
-    steps = relative(poses[:-1], poses[1:])
-    size = np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
-    duration = np.maximum(np.abs(np.diff(times)), 1e-6)
-    is_zero = size < 1e-9
-    moving = np.flatnonzero(~is_zero)
-    shared, is_shared, count = poses, np.zeros(len(poses), bool), 0
-    for place in range(1, len(moving) - 1):
-        before, leap = int(moving[place - 1]), int(moving[place])  # steps that moved
-        repeats = leap - before - 1
-        if not 1 <= repeats <= MAX_LATCHED or size[leap] < MIN_LEAP:
-            continue
-        beside = np.concatenate(
-            [moving[max(place - NEIGHBOURS, 0) : place], moving[place + 1 :][:NEIGHBOURS]]
-        )
-        usual_speed = size[beside].sum() / duration[beside].sum()
-        shared_speed = size[leap] / duration[before + 1 : leap + 1].sum()
-        if (
-            size[leap] <= LEAP_RATIO * np.median(size[beside])
-            or size[leap] <= LEAP_RATIO * usual_speed * duration[leap]
-            or shared_speed > MAX_SHARED_RATIO * usual_speed
-            or np.dot(steps[leap], steps[beside].sum(axis=0)) <= 0.0
-        ):
-            continue
-        first, last = before + 1, leap + 1  # poses that the leap is shared out between
-        ends = np.sort(times[[first, last]])
-        if ends[0] < ends[1]:
-            if shared is poses:
-                shared = poses.copy()
-            inner = times[first:last].clip(*ends)
-            shared[first:last] = interpolate_poses(inner, ends, poses[[first, last]])
-        is_shared[first + 1 : last + 1] = True
-        count += 1
-    return shared, is_shared, count
 
 
 def poses_are_corrected(

@@ -5,10 +5,10 @@ from jaxslam.matching.icp import ScanMatchSpec as ScanMatchSpec
 from jaxslam.matching.icp import Submap as Submap
 from jaxslam.matching.loop_closure import LoopClosures as LoopClosures
 from jaxslam.matching.loop_closure import find_loop_closures as find_loop_closures
+from jaxslam.matching.odometry_fusion import fuse_odometry as fuse_odometry
 from jaxslam.matching.registration import LoopClosureSpec as LoopClosureSpec
 from jaxslam.matching.registration import Registration as Registration
 from jaxslam.matching.registration import register_scan as register_scan
 from jaxslam.matching.scan_matching import empty_submap as empty_submap
-from jaxslam.matching.scan_matching import fuse_odometry as fuse_odometry
 from jaxslam.matching.scan_matching import match_scan as match_scan
 from jaxslam.matching.scan_matching import match_scans as match_scans

@@ -29,6 +29,7 @@ from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
 from jaxslam.core.types import Array
+from jaxslam.matching.correlative import CorrelativeSpec
 from jaxslam.matching.oriented_points import OrientedPoints
 
 FAR_AWAY = 1e6
@@ -58,6 +59,13 @@ class ScanMatchSpec(NamedTuple):
             the errors of neighbouring points are correlated.
         odometry_std_floor: [m], [rad] least std of the odometry prior.
         odometry_slip: Std of the odometry prior as fractions of distance and of turn.
+        use_odometry: Whether the wheels are used; without, the motion is expected to be as before.
+        max_inlier_drop: Inlier fraction that the quick match may have less than is usual; below, a
+            wide window is searched too.
+        lost_inliers: Inlier fraction below which all headings are searched.
+        min_gain: Inlier fraction that a pose of the wide search must have in addition.
+        search_std: [m], [rad] std of its candidates, for ICP.
+        search: Options of the wide search.
     """
 
     window_scans: int = 25
@@ -74,6 +82,28 @@ class ScanMatchSpec(NamedTuple):
     point_std: float = 0.1
     odometry_std_floor: tuple[float, float] = (0.05, 0.1)
     odometry_slip: tuple[float, float] = (0.1, 1.0)
+    use_odometry: bool = True
+    max_inlier_drop: float = 0.1
+    lost_inliers: float = 0.3
+    min_gain: float = 0.03
+    search_std: tuple[float, float] = (0.2, 0.3)
+    search: CorrelativeSpec = CorrelativeSpec()
+
+
+class MotionHistory(NamedTuple):
+    """What is remembered of the motion and of the matches, from scan to scan.
+
+    Attributes:
+        increment: (3,) [m, m, rad] the last increment.
+        usual_change: (2,) [m], [rad] running mean of its change from scan to scan.
+        distrust: () 0 to 1, how often of late the wheels contradicted the scans.
+        usual_inliers: () running mean of the inlier fraction.
+    """
+
+    increment: Array
+    usual_change: Array
+    distrust: Array
+    usual_inliers: Array
 
 
 class Submap(NamedTuple):
@@ -84,12 +114,14 @@ class Submap(NamedTuple):
         poses: (K, 3) [m, m, rad] of the keyframes.
         num_added: () int32 keyframes ever added; number n is in slot n modulo K.
         last_pose: (3,) [m, m, rad] of the last scan, keyframe or not.
+        motion: What is remembered of the motion.
     """
 
     oriented_points: OrientedPoints
     poses: Array
     num_added: Array
     last_pose: Array
+    motion: MotionHistory
 
 
 class PosePrior(NamedTuple):

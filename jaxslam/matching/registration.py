@@ -17,6 +17,7 @@ from jaxslam.core.types import Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
 from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
+from jaxslam.matching.motion_prior import first_history
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
 
 GUESS_PENALTY = 0.02
@@ -140,7 +141,7 @@ def register_scan(
 
     surfaces = jax.vmap(partial(oriented_points, lidar))(submap_scans)
     surfaces = jax.vmap(transform_points)(submap_poses, surfaces)
-    submap = Submap(surfaces, submap_poses, jnp.int32(spec.submap_scans), guess)
+    submap = Submap(surfaces, submap_poses, jnp.int32(spec.submap_scans), guess, first_history())
     every = -(-lidar.num_beams // scan_matching.max_beams)
     points, hit = beam_ends(lidar, scan)[::every], scan.hit[::every]
     std = jnp.array([spec.guess_std[0], spec.guess_std[0], spec.guess_std[1]])

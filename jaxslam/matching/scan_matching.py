@@ -4,7 +4,12 @@ The submap holds the points of the last keyframe scans, with the normals of the 
 on. A scan is registered where its points are on these surfaces. ICP starts from several headings
 around that of the odometry, as wheels slip most where a robot turns. The odometry is also a weak
 prior, which keeps directions that the scans do not constrain, such as along a bare corridor.
-The information returned with each increment is that of the scans alone; `fuse_odometry` combines
+
+Wheels may be wrong by far more than that: they slip, hang, or repeat old values. Where this quick
+match explains less of the scan than usual, contradicts the wheels, or the wheels leap,
+`wide_search` looks further. Wheels that are contradicted again and again are trusted less
+(`motion_prior`); with `use_odometry=False` they are not used at all.
+The information returned with each increment is that of the scans alone; `odometry_fusion` combines
 both. `icp` has the formulas.
 
     submap = empty_submap(spec, lidar)
@@ -22,7 +27,6 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.core import trace_cache
-from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
@@ -30,13 +34,19 @@ from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
 from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
+from jaxslam.matching.motion_prior import (
+    change_variance,
+    contradicts,
+    expected_motion,
+    first_history,
+    is_leap,
+    next_history,
+)
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
+from jaxslam.matching.wide_search import fine_icp, search_widely
 
 TURN_PENALTY = 0.005
 """Inlier fraction that a heading 1 std off the odometry must have in addition."""
-
-FUSION_STD_FLOOR = (0.01, 0.005)
-"""[m], [rad] least std of odometry where it is fused with scans."""
 
 
 def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
@@ -51,7 +61,9 @@ def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
     nothing = OrientedPoints(
         jnp.zeros((*size, 2)), jnp.zeros((*size, 2)), jnp.zeros(size), jnp.zeros(size, bool)
     )
-    return Submap(nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3))
+    return Submap(
+        nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3), first_history()
+    )
 
 
 def match_scan(
@@ -59,12 +71,15 @@ def match_scan(
 ) -> tuple[Submap, ScanMatch]:
     """Match one scan, coarse to fine, and add it to the submap if it is a keyframe.
 
-        1. Predict the pose by odometry; its std grows with the motion, by `spec.odometry_slip`.
+        1. Predict the pose by odometry, as far as it is trusted; its std grows with the motion, by
+           `spec.odometry_slip`.
         2. Coarse search: ICP from each of `spec.heading_guesses`, of few points to recent
            keyframes.
         3. Keep the start of the largest inlier fraction, less a penalty on its turn.
         4. Refine: ICP of all points to all keyframes, with closer correspondences.
-        5. If that is not finite, the predicted pose and no information.
+        5. If this explains little, or contradicts the wheels, search a wide window as well. Under
+           `jax.vmap` that is computed for every scan, whether needed or not.
+        6. If the result is not finite, the predicted pose and no information.
 
     It is one step, for robots online: call it by `jax.jit(match_scan, static_argnums=(0, 1))`.
 
@@ -124,68 +139,49 @@ def match_scans(
     return _match_scans(spec, lidar, submap, scans, odometry, count)
 
 
-def fuse_odometry(
-    std_scale: Array, odometry: Array, odometry_cov: Array, scan_match: ScanMatch
-) -> tuple[Array, Array]:
-    """Increment (3,) by odometry and scan matching together, and its covariance (3, 3).
-
-    A Kalman update in information form: cov = (Q^-1 + H / std_scale^2)^-1, with the covariance Q
-    of the odometry and the information H of the scan. Without any, odometry and its covariance
-    are returned as they are.
-
-    Args:
-        std_scale: () factor on the standard deviation of scan matching.
-        odometry: (3,) [m, m, rad] odometry increment.
-        odometry_cov: (3, 3) its covariance; `FUSION_STD_FLOOR` is added where there is something
-            to fuse it with.
-        scan_match: Result of scan matching.
-    """
-    information = scan_match.information / std_scale**2
-    floor = jnp.array([FUSION_STD_FLOOR[0], FUSION_STD_FLOOR[0], FUSION_STD_FLOOR[1]]) ** 2
-    odometry_root = inverse_cholesky(odometry_cov + jnp.diag(floor))[0]
-    cov_root = inverse_cholesky(odometry_root.T @ odometry_root + information)[0]
-    cov = cov_root.T @ cov_root
-    innovation = scan_match.increment - odometry
-    innovation = innovation.at[2].set(wrap_angle(innovation[2]))
-    matched = jnp.any(scan_match.information != 0.0)
-    increment = odometry + cov @ (information @ innovation)
-    return jnp.where(matched, increment, odometry), jnp.where(matched, cov, odometry_cov)
-
-
 def _match_scan(
     spec: ScanMatchSpec, lidar: Lidar, submap: Submap, scan: Scan, odometry: Array
 ) -> tuple[Submap, ScanMatch]:
     """`match_scan` of what has been checked."""
     every = -(-lidar.num_beams // spec.max_beams)
     points, hit = beam_ends(lidar, scan)[::every], scan.hit[::every]
-    predicted = compose(submap.last_pose, odometry)
-    moved = jnp.stack([jnp.hypot(odometry[0], odometry[1]), jnp.abs(odometry[2])])
-    variance = (
-        jnp.array(spec.odometry_std_floor) ** 2 + (jnp.array(spec.odometry_slip) * moved) ** 2
-    )
-    odometry_information = jnp.diag(1.0 / jnp.stack([variance[0], variance[0], variance[1]]))
-    prior = PosePrior(predicted, odometry_information)
+    before, history = submap.last_pose, submap.motion
+    if not spec.use_odometry:
+        odometry = history.increment
+    motion = expected_motion(spec, history, odometry, history.distrust)
+    turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))  # from the frame of the pose before
+    information = turn @ jnp.diag(motion.information) @ turn.T
+    prior = PosePrior(compose(before, motion.increment), information)
 
-    start = _best_start(spec, lidar, submap, prior, variance[1], points, hit)
-    pose, information, inlier_fraction = icp(
-        spec,
-        lidar,
-        submap,
-        prior,
-        start,
-        points,
-        hit,
-        gates=spec.fine_gates,
-        kernel_scale=spec.kernel_scales[1],
+    start = _best_start(spec, lidar, submap, prior, 1.0 / motion.information[2], points, hit)
+    quick = fine_icp(spec, lidar, submap, prior, start, points, hit)
+    explains_little = quick.inlier_fraction < history.usual_inliers - spec.max_inlier_drop
+    odd = explains_little | is_leap(history, odometry)
+    odd |= contradicts(spec, odometry, relative(before, quick.pose))
+    match = lax.cond(
+        odd & (submap.num_added > 0),
+        partial(search_widely, spec, lidar, submap, odometry, points, hit),
+        lambda quick: quick,
+        quick,
     )
-    finite = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
-    pose, information = jnp.where(finite, pose, predicted), jnp.where(finite, information, 0.0)
+    finite = jnp.all(jnp.isfinite(match.pose)) & jnp.all(jnp.isfinite(match.information))
+    pose = jnp.where(finite, match.pose, prior.pose)
     pose = pose.at[2].set(wrap_angle(pose[2]))
-    # From the frame of the pose before.
-    turn = jnp.eye(3).at[:2, :2].set(rotation(submap.last_pose[2]))
-    increment = relative(submap.last_pose, pose)
-    match = ScanMatch(increment, turn.T @ information @ turn, inlier_fraction)
-    return _add_keyframe(spec, lidar, submap, scan, pose), match
+    information = jnp.where(finite, match.information, 0.0)
+    increment = relative(before, pose)
+    contradicted = contradicts(spec, odometry, increment)
+    distrust = jnp.where(contradicted, 1.0, history.distrust)
+    expected = expected_motion(spec, history, odometry, distrust)
+    result = ScanMatch(
+        increment,
+        turn.T @ information @ turn,
+        match.inlier_fraction,
+        expected.increment,
+        (1.0 - expected.odometry_weight) * change_variance(history),
+        expected.odometry_weight,
+    )
+    history = next_history(history, increment, match.inlier_fraction, contradicted)
+    return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), result
 
 
 def _best_start(
@@ -244,6 +240,7 @@ def _add_keyframe(
         put(submap.poses, pose),
         submap.num_added + new.astype(jnp.int32),
         pose,
+        submap.motion,
     )
 
 

@@ -18,6 +18,7 @@ from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching import loop_closure
+from jaxslam.matching.latched_odometry import share_out_leaps
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.pipeline import arguments, chunks, online
 from jaxslam.pipeline.chunks import ChunkResult
@@ -29,6 +30,7 @@ from jaxslam.smoothing.problem import SmoothingProblem, SmoothingResult
 
 # Searches for loop closures at most, each from the trajectory smoothed before it.
 MAX_CLOSURE_ROUNDS = 2
+MIN_CONTRADICTED = 0.01  # fraction of the scans from which contradictions are noted
 CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further than this
 # Numbers of scans and landmarks are padded to multiples of this to be smoothed.
 PADDING_MULTIPLE = 512
@@ -50,6 +52,9 @@ class SlamResult(NamedTuple):
         topological_map: Topological map.
         scan_matches: [T] increments by scan matching, where scans were matched.
         loop_closures: Loop closures that the trajectory was smoothed with, where there were any.
+        odometry: (T, 3) [m, m, rad] increments that the filter was given: repaired, or zero where
+            odometry is not used.
+        notes: What was wrong with the odometry, to be printed.
     """
 
     poses: np.ndarray
@@ -59,6 +64,8 @@ class SlamResult(NamedTuple):
     topological_map: TopologicalMap
     scan_matches: ScanMatch | None = None
     loop_closures: LoopClosures | None = None
+    odometry: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
 def run_slam(
@@ -102,6 +109,11 @@ def run_slam(
     # NumPy, as each slice of a JAX array would be compiled.
     scans = arguments.as_scans(config.frontend.lidar, ranges, len(increments))
     pose = arguments.as_start(start)
+    notes: tuple[str, ...] = ()
+    if match_scans and config.scan_matching.use_odometry:
+        increments, notes = _repaired(increments, scans)
+    elif match_scans:
+        increments = np.zeros_like(increments)
     state, parts = online.init(config, pose, match_scans=match_scans), []
     following = chunks.extract_chunk(config, state.submap, *chunks.chunk_at(0, increments, scans))
     for first in range(0, len(increments), chunks.CHUNK):
@@ -129,7 +141,35 @@ def run_slam(
         )
         state = state._replace(belief=belief)
     topological_map = online.topological_map(config, state, poses)
-    return SlamResult(poses, state.belief, info, features, topological_map, matches, closures)
+    if match_scans and config.scan_matching.use_odometry:
+        notes += _contradictions(np.asarray(matches.odometry_weight))
+    return SlamResult(
+        poses,
+        state.belief,
+        info,
+        features,
+        topological_map,
+        matches,
+        closures,
+        increments,
+        notes,
+    )
+
+
+def _repaired(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Odometry (T, 3) whose leaps are shared out, and a note if there were any."""
+    odometry, num_leaps = share_out_leaps(odometry, scans)
+    note = f"{num_leaps} leaps after latched poses shared out over the scans before"
+    return odometry, (note,) if num_leaps else ()
+
+
+def _contradictions(odometry_weight: np.ndarray) -> tuple[str, ...]:
+    """A note if scans contradict the odometry, of weights (T,), more than now and then."""
+    contradicted = int(np.sum(odometry_weight < 0.5))
+    if contradicted < MIN_CONTRADICTED * len(odometry_weight):
+        return ()
+    note = f"contradicted by scan matching at {contradicted} of {len(odometry_weight)} scans"
+    return (f"{note}, where it is not used",)
 
 
 def smooth_result(

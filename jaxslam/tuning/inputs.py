@@ -20,8 +20,11 @@ SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
     "increment": (3,),
     "information": (3, 3),
     "inlier_fraction": (),
+    "expected": (3,),
+    "expected_variance": (3,),
+    "odometry_weight": (),
 }
-"""Sizes after B and T of each field of `ScanMatch`, in its order; all are floats."""
+"""Sizes after B and T of each field of `ScanMatch`; all are floats, the last three perhaps None."""
 
 ORDER = "; the order is config, params, episodes"  # two that were swapped are the usual cause
 
@@ -110,11 +113,13 @@ def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") ->
     matches = episodes.scan_matches
     if matches is not None:
         check_type(f"{name}.scan_matches", matches, ScanMatch)
+        given = matches._asdict()
         matches = ScanMatch(
-            *(
-                _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
-                for (field, sizes), x in zip(SCAN_MATCH_FIELDS.items(), matches, strict=True)
-            )
+            **{
+                field: _convert(f"{name}.scan_matches.{field}", x, (b, t, *sizes), jnp.floating)
+                for field, sizes in SCAN_MATCH_FIELDS.items()
+                if (x := given[field]) is not None
+            }
         )
     return Episode(
         truth=_convert(f"{name}.truth", episodes.truth, (b, t, 3), jnp.floating),

@@ -6,11 +6,10 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from simulated_scans import CORRIDOR, LIDAR, item, odometry_of, scans_of
 
-from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2 import compose, relative, transform
 from jaxslam.frontend import lidar
-from jaxslam.matching import oriented_points, scan_matching
+from jaxslam.matching import fuse_odometry, oriented_points
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.scan_matching import empty_submap, match_scan, match_scans
 from jaxslam.simulation import path_following, worlds
@@ -111,7 +110,7 @@ def test_a_bare_corridor_does_not_constrain_the_position_along_it():
     true = odometry_of(poses)
     wheels = true.at[1:].add(jnp.array([0.04, 0.03, 0.05]))
     found = matches_of(scans_of(CORRIDOR, poses, 0.005), wheels)
-    true, wheels, fuse = np.asarray(true), np.asarray(wheels), jax.jit(scan_matching.fuse_odometry)
+    true, wheels, fuse = np.asarray(true), np.asarray(wheels), jax.jit(fuse_odometry)
     along = np.array([np.cos(0.1), -np.sin(0.1), 0.0])  # frame of the robot
     across = np.array([np.sin(0.1), np.cos(0.1), 0.0])
     noise = np.diag(np.array([0.05, 0.05, 0.05]) ** 2)
@@ -147,58 +146,6 @@ def test_scans_without_returns_give_the_odometry():
     found = matches_of(blind, wheels)
     np.testing.assert_allclose(found.increment, wheels, atol=1e-6)
     assert not np.asarray(found.information).any() and not np.asarray(found.inlier_fraction).any()
-
-
-def some_match(rank):
-    a = np.random.default_rng(1).normal(size=(rank, 3)) * 30
-    return ScanMatch(jnp.array([0.52, 0.03, 0.4]), jnp.asarray(a.T @ a), jnp.asarray(0.9))
-
-
-def test_a_fused_increment_is_that_of_a_kalman_update():
-    wheels, scale = jnp.array([0.5, 0.0, 0.3]), 0.7
-    noise = np.diag([0.03, 0.02, 0.05]) ** 2 + 1e-5
-    match = some_match(3)
-    fused, cov = scan_matching.fuse_odometry(jnp.asarray(scale), wheels, jnp.asarray(noise), match)
-    prior = noise + np.diag(
-        [*[scan_matching.FUSION_STD_FLOOR[0] ** 2] * 2, scan_matching.FUSION_STD_FLOOR[1] ** 2]
-    )
-    r = scale**2 * np.linalg.inv(match.information)
-    gain = prior @ np.linalg.inv(prior + r)
-    np.testing.assert_allclose(fused, wheels + gain @ (match.increment - wheels), rtol=1e-9)
-    np.testing.assert_allclose(cov, prior - gain @ prior, rtol=1e-7)
-
-
-def test_fusing_with_nothing_changes_nothing_and_headings_are_wrapped():
-    wheels, noise = jnp.array([0.5, 0.0, 3.1]), jnp.diag(jnp.array([1e-4, 2e-4, 3e-4]))
-    nothing = some_match(3)._replace(information=jnp.zeros((3, 3)))
-    fused, cov = scan_matching.fuse_odometry(jnp.asarray(1.0), wheels, noise, nothing)
-    np.testing.assert_array_equal(fused, wheels)
-    np.testing.assert_array_equal(cov, noise)
-    beyond = some_match(3)._replace(increment=jnp.array([0.5, 0.0, -3.1]))
-    fused, _ = scan_matching.fuse_odometry(jnp.asarray(1.0), wheels, noise, beyond)
-    assert 3.1 < fused[2] < 2 * np.pi - 3.1
-
-
-@pytest.mark.parametrize("rank", [0, 1, 3])
-def test_gradients_of_a_fused_increment_are_finite_and_right(rank):
-    wheels = jnp.array([0.5, 0.1, 0.3])
-    match = some_match(max(rank, 1))
-    match = match if rank else match._replace(information=jnp.zeros((3, 3)))
-
-    @jax.jit
-    def value(scale, variance):
-        noise = jnp.diag(variance * jnp.array([1.0, 0.5, 2.0]))
-        fused, cov = scan_matching.fuse_odometry(scale, wheels, noise, match)
-        return jnp.sum(fused**2) + jnp.sum(cov)
-
-    given = jnp.asarray(0.7), jnp.asarray(1e-3)
-    slope = jax.jit(jax.grad(value, argnums=(0, 1)))(*given)
-    for i in range(2):
-        step = 1e-4 * given[i]
-        up, down = (list(given) for _ in range(2))
-        up[i], down[i] = given[i] + step, given[i] - step
-        expected = (value(*up) - value(*down)) / (2 * step)
-        np.testing.assert_allclose(slope[i], expected, rtol=1e-5, atol=1e-9)
 
 
 def refusals():

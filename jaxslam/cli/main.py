@@ -30,6 +30,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit code: 2 for bad input, 130 for Ctrl-C.
 
+    `run --strict` returns 3 if the map contradicts itself.
+
     Args:
         argv: Arguments; by default those of the process, and `--help` if there are none.
 
@@ -45,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
         if command in COMMANDS:
             function = COMMANDS[command]
             function.__doc__ = _unwrapped(function.__doc__ or "")
-            tyro.cli(function, prog=f"jaxslam {command}", args=options)
+            return tyro.cli(function, prog=f"jaxslam {command}", args=options) or 0
         else:
             _usage(argv)
     except InputError as error:

@@ -1,5 +1,6 @@
 """Files and figures of a result."""
 
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -106,6 +107,7 @@ def draw(
     *,
     world: World | None = None,
     scans: Scan | None = None,
+    wrong: Sequence[tuple[int, int]] = (),
 ) -> None:
     """Draw path.png and errors.png.
 
@@ -117,6 +119,7 @@ def draw(
         error: (T, 3) pose errors [m, m, rad], if known.
         world: World whose walls are drawn.
         scans: Scans [T] whose end points are drawn.
+        wrong: First and last number of scans where the map contradicts itself.
     """
     # Imported here, because matplotlib is slow to import.
     from jaxslam.viz import canvas, charts, maps
@@ -135,6 +138,7 @@ def draw(
         maps.draw_hits(axis, poses, np.asarray(points), np.asarray(scans.hit))
     for what, line in (lines | {"estimate": poses}).items():
         maps.draw_trajectory(axis, line, what)
+    maps.draw_wrong_parts(axis, poses, wrong)
     maps.draw_arcs(axis, result.topological_map)
     maps.draw_landmarks(axis, result.belief, confirm_count=config.filter.confirm_count)
     maps.draw_start_and_end(axis, poses)

@@ -29,7 +29,7 @@ from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import compose, relative
 from jaxslam.core.se2_np import increments as increments_of
-from jaxslam.evaluation import log_errors
+from jaxslam.evaluation import log_errors, map_consistency
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
@@ -43,6 +43,8 @@ from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import SlamResult
 from jaxslam.pipeline.online import ChunkResult, SlamState
 from jaxslam.viz.rerun_view import RerunView
+
+INCONSISTENT = 3  # exit code of `--strict`
 
 
 def run(
@@ -62,14 +64,16 @@ def run(
         Literal["live", "file"] | None,
         tyro.conf.arg(metavar="{live,file}", help_behavior_hint=""),
     ] = None,
+    strict: bool = False,
     out: OutFolder = Path("out"),
-) -> None:
+) -> int:
     """Run SLAM on a laser log.
 
     Writes metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson
     and, with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for
     map_server and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of
-    the first scan is the origin of the map.
+    the first scan is the origin of the map. A WARNING names the scans where the map contradicts
+    itself, because the run was lost there; path.png marks them.
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is
@@ -90,6 +94,7 @@ def run(
         gif: Write an animation of the run: run.gif.
         rerun: Show the run in the rerun viewer while it is processed (live), or write run.rrd for
             it (file); needs the extra [view].
+        strict: Exit with code 3 if the map contradicts itself; all results are still written.
         out: Folder for the results.
     """
     laser_log = scanner.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
@@ -152,6 +157,8 @@ def run(
             "seconds": seconds,
         }
         numbers |= _errors(laser_log, result, known, verified, smooth=smooth)
+        consistency = map_consistency.check_map(config.frontend.lidar, result.poses, scans)
+        numbers["map_consistency"] = consistency.metrics()
         if dead_reckoning:
             numbers["dead_reckoning"] = dead_reckoning
         report.write_results(out_dir, numbers, laser_log.times, result)
@@ -173,7 +180,8 @@ def run(
             )
             if log_errors.has_heading(known):
                 error = _online_errors(laser_log, result, known)
-        report.draw(out_dir, config, result, trajectories, error, scans=scans)
+        wrong = [(warning.first_scan, warning.last_scan) for warning in consistency.warnings]
+        report.draw(out_dir, config, result, trajectories, error, scans=scans, wrong=wrong)
         if scan is not None:
             report.draw_scan(out_dir / "scan.png", config, scans, scan)
         if gif:
@@ -183,6 +191,7 @@ def run(
                 out_dir / "run.gif", config, params, measurements, scans, result.poses, odom_poses
             )
     summaries.print_summary(numbers, f"{len(result.poses)} scans of {log}", out)
+    return INCONSISTENT if strict and consistency.warnings else 0
 
 
 def _errors(

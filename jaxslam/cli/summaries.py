@@ -1,7 +1,7 @@
 """Printed summaries of results."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ SUMMARY_ROWS = (
     ("translation_mean_m", "relation error, translation", "m"),
     ("rotation_mean_deg", "relation error, rotation", "deg"),
 )
+MAX_WARNINGS = 5  # that are printed
 
 
 def print_summary(numbers: Metrics, title: str, out: Path) -> None:
@@ -40,8 +41,28 @@ def print_summary(numbers: Metrics, title: str, out: Path) -> None:
     print(f"  {'updates per scan':34}{numbers['matches']:10.1f}")
     if numbers.get("closures"):
         print(f"  {'loop closures':34}{numbers['closures']:10d}")
+    consistency = numbers.get("map_consistency")
+    if consistency is not None:
+        _print_consistency(consistency)
     _print_seconds(numbers)
+    if consistency is not None:
+        _print_warnings(consistency["warnings"])
     print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")
+
+
+def _print_consistency(consistency: Metrics) -> None:
+    """Print the share of scans that the map explains, and how far walls of two visits are apart."""
+    walls = consistency["walls_median_m"]
+    distance = "" if walls is None else f"{walls:10.3f}"
+    print(f"  {'explained scans, wall offset [m]':34}{consistency['explained']:10.1%}{distance}")
+
+
+def _print_warnings(warnings: Sequence[Metrics]) -> None:
+    """Print where the map contradicts itself."""
+    for warning in warnings[:MAX_WARNINGS]:
+        print(f"WARNING: {warning['reason']}")
+    if len(warnings) > MAX_WARNINGS:
+        print(f"WARNING: {len(warnings) - MAX_WARNINGS} more parts are listed in metrics.json")
 
 
 def _print_errors(slam_errors: Metrics, odometry_errors: Metrics) -> None:

@@ -1,4 +1,4 @@
-"""Errors: ATE, RPE and relations of trajectories, NEES of beliefs, summaries of trials and maps."""
+"""Errors of trajectories, NEES of beliefs, consistency of maps, summaries of trials and maps."""
 
 from jaxslam.evaluation.consistency import chi_square_bounds as chi_square_bounds
 from jaxslam.evaluation.consistency import nees as nees
@@ -9,6 +9,9 @@ from jaxslam.evaluation.log_errors import Trajectory as Trajectory
 from jaxslam.evaluation.log_errors import errors_against as errors_against
 from jaxslam.evaluation.log_errors import mean_ate as mean_ate
 from jaxslam.evaluation.log_errors import mean_nees_per_dof as mean_nees_per_dof
+from jaxslam.evaluation.map_consistency import MapConsistency as MapConsistency
+from jaxslam.evaluation.map_consistency import check_map as check_map
+from jaxslam.evaluation.map_warnings import MapWarning as MapWarning
 from jaxslam.evaluation.summary import Metrics as Metrics
 from jaxslam.evaluation.summary import evaluate as evaluate
 from jaxslam.evaluation.trajectory import align_trajectory as align_trajectory

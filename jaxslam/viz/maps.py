@@ -3,6 +3,7 @@
 Lines differ in style as well as in colour, and landmarks in shape.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -81,6 +82,24 @@ def draw_trajectory(axis: Axes, poses: AnyArray, what: str) -> None:
     colour, width, style, zorder = TRAJECTORY_STYLES[what]
     x, y = as_float64("poses", poses, ("T", 3))[:, :2].T
     axis.plot(x, y, label=what, color=colour, linewidth=width, linestyle=style, zorder=zorder)
+
+
+def draw_wrong_parts(axis: Axes, poses: AnyArray, parts: Sequence[tuple[int, int]]) -> None:
+    """Mark parts of a trajectory where the map contradicts itself; nothing without any.
+
+    Args:
+        axis: Axis to draw on.
+        poses: (T, 3) [m, m, rad], map frame.
+        parts: First and last index of each part.
+
+    Raises:
+        ValueError: `poses` has another shape.
+    """
+    xy = as_float64("poses", poses, ("T", 3))[:, :2]
+    for k, (first, last) in enumerate(parts):
+        x, y = xy[first : last + 1].T
+        label = "_wrong" if k else "map contradicts itself"
+        axis.plot(x, y, "o-", color=RED, markersize=8, linewidth=6, zorder=3.5, label=label)
 
 
 def draw_robot(axis: Axes, pose: AnyArray, ends: AnyArray) -> None:

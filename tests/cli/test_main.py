@@ -229,6 +229,13 @@ def test_run_starts_at_the_origin_on_the_clock_of_the_log(done):
 
 
 @pytest.mark.slow
+def test_run_checks_its_map(done):
+    consistency = load(done.recorded)["map_consistency"]
+    assert consistency["explained"] == 1.0 and consistency["warnings"] == []
+    assert "explained scans" in done.said_of_log and "WARNING" not in done.said_of_log
+
+
+@pytest.mark.slow
 def test_run_says_how_many_lines_it_skipped(done):
     assert "1 broken lines" in done.said_of_log or "1 broken line" in done.said_of_log
 

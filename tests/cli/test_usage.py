@@ -54,7 +54,7 @@ OPTIONS = {
     "simulate": "--world --trials --seed --noise --landmarks --labels --out",
     "run": "--reference --relations --odometry --smooth --no-smooth --noise --scan-topic "
     "--odometry-topic --mount --upside-down --scan-frame --base-frame --odom-frame "
-    "--angle-increment --pose-frame --scan --gif --rerun --out",
+    "--angle-increment --pose-frame --scan --gif --rerun --strict --out",
     "map": "--robot-radius --min-obstacle-size --regions --out",
     "tune": "--test --reference --odometry --world --trials --heldout --loss --updates --batch "
     "--patience --freeze --noise --mount --upside-down --scan-frame --base-frame --odom-frame "

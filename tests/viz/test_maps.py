@@ -39,6 +39,16 @@ def test_walls_are_those_of_the_world(axis):
     np.testing.assert_allclose(np.array(drawn.get_segments()).reshape(-1, 4), world.walls)
 
 
+def test_wrong_parts_of_a_trajectory_are_marked_in_red(axis):
+    poses = np.arange(18.0).reshape(6, 3)
+    maps.draw_wrong_parts(axis, poses, [(1, 3), (5, 5)])
+    drawn = [line.get_xydata() for line in axis.lines]
+    np.testing.assert_allclose(drawn[0], poses[1:4, :2])
+    np.testing.assert_allclose(drawn[1], poses[5:, :2])
+    assert {line.get_color() for line in axis.lines} == {canvas.RED}
+    assert [line.get_label() for line in axis.lines] == ["map contradicts itself", "_wrong"]
+
+
 def test_confirmed_landmarks_are_drawn_with_three_sigma_ellipses(axis):
     maps.draw_landmarks(axis, belief(), confirm_count=2)
     positions = [line.get_xydata().tolist() for line in axis.lines]

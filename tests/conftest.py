@@ -37,11 +37,11 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 
-@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
-def precision(request) -> Iterator[str]:
-    """Run a test in float32, as users do, and slowly in float64, too, as all other tests do."""
-    with jax.enable_x64(request.param == "float64"):
-        yield request.param
+@pytest.fixture
+def single_precision() -> Iterator[None]:
+    """Run a test in float32, as users do; the others run in float64."""
+    with jax.enable_x64(False):
+        yield
 
 
 @pytest.fixture(scope="session")

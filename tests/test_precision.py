@@ -1,7 +1,6 @@
 """The chain from simulated scans to filtered poses, gradients, a smoothed log and its map.
 
-It runs in float32, as users do; all other tests run in float64, and with `pytest -m slow` so does
-this one.
+It runs in float32, as users do; the other tests run in float64.
 """
 
 import jax
@@ -28,9 +27,7 @@ CONFIG = Config.for_lidar(
 )
 SCANS = 16
 
-
-def dtype(precision):
-    return jnp.dtype(precision)
+pytestmark = pytest.mark.usefixtures("single_precision")
 
 
 def scans_of_a_drive():
@@ -40,12 +37,12 @@ def scans_of_a_drive():
     return drives.simulate_scans(key, CONFIG.frontend.lidar, Robot(), world, path, num_scans=SCANS)
 
 
-def test_features_are_the_same_in_both_precisions(precision):
+def test_features_are_the_same_in_both_precisions():
     world = worlds.World(jnp.asarray(worlds.named("office").walls, float))
     scan = ray_casting.cast(CONFIG.frontend.lidar, world, jnp.array([10.35, 5.0, 1.5]))
     extract = jax.jit(extract_features, static_argnums=0)
     found = extract(CONFIG.frontend, scan)
-    assert found.xy.dtype == dtype(precision)
+    assert found.xy.dtype == jnp.float32
     with jax.enable_x64(True):
         ranges = np.asarray(scan.ranges, np.float64)
         exact = extract(CONFIG.frontend, to_scan(CONFIG.frontend.lidar, ranges))
@@ -53,11 +50,11 @@ def test_features_are_the_same_in_both_precisions(precision):
     np.testing.assert_allclose(found.xy, exact.xy, atol=1e-4)
 
 
-def test_filter_and_its_gradients(precision):
+def test_filter_and_its_gradients():
     episodes = simulate_episodes(jax.random.key(0), CONFIG, num_trials=2, num_scans=SCANS)
     params = NoiseParams.for_simulated_robot()
     results = filter_episodes(CONFIG, params, episodes)
-    assert results.estimate.dtype == dtype(precision)
+    assert results.estimate.dtype == jnp.float32
     numbers = evaluate(results)
     assert numbers["diverged"] == numbers["nonfinite"] == 0 and numbers["position_rmse_m"] < 0.05
     values, slopes = gradients(CONFIG, params, episodes)
@@ -65,7 +62,7 @@ def test_filter_and_its_gradients(precision):
 
 
 @pytest.mark.parametrize("match_scans", [False, True])
-def test_a_log_is_mapped_and_smoothed(precision, match_scans):
+def test_a_log_is_mapped_and_smoothed(match_scans):
     truth, odometry, scans = scans_of_a_drive()
     config = Config.for_laser_log(CONFIG.frontend.lidar, max_landmarks=64)
     config = config._replace(frontend=CONFIG.frontend)
@@ -73,6 +70,6 @@ def test_a_log_is_mapped_and_smoothed(precision, match_scans):
     result = run_slam(
         config, params, odometry, scans.ranges, start=truth[0], match_scans=match_scans
     )
-    assert result.info.pose.dtype == dtype(precision)
+    assert result.info.pose.dtype == jnp.float32
     assert np.abs(result.poses - np.asarray(truth))[:, :2].max() < 0.1
     assert len(result.topological_map.xy) > 3

@@ -214,10 +214,11 @@ def test_lists_numpy_and_jax_arrays_give_the_same_result():
     assert np.isfinite(results[0][1]).all()
 
 
-def test_whole_numbers_are_taken_as_noise(precision):
+@pytest.mark.usefixtures("single_precision")
+def test_whole_numbers_are_taken_as_noise():
     whole = NoiseParams([1, 1, 1, 1], 1, 1, 1, 1)
     floats = convert(whole, lambda x: np.asarray(x, np.float64))
-    assert as_episodes(EPISODES).truth.dtype == np.dtype(precision)
+    assert as_episodes(EPISODES).truth.dtype == np.float32
     results = [fitting.values(CONFIG, params, EPISODES) for params in (whole, floats)]
     np.testing.assert_array_equal(*results)
     assert np.isfinite(results[0]).all()

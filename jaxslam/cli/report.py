@@ -30,11 +30,17 @@ KINDS = ("node", "corner", "wall")
 MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
 
 
-def write_results(out_dir: Path, numbers: Metrics, times: np.ndarray, result: SlamResult) -> None:
+def write_results(
+    out_dir: Path,
+    numbers: Metrics,
+    times: np.ndarray,
+    poses: np.ndarray,
+    topological_map: TopologicalMap,
+) -> None:
     """Write metrics.json, trajectory.tum and map.geojson to the folder `out_dir`."""
     write_json(out_dir / "metrics.json", numbers)
-    tum.write(out_dir / "trajectory.tum", times, result.poses)
-    write_map(out_dir / "map.geojson", result.topological_map)
+    tum.write(out_dir / "trajectory.tum", times, poses)
+    write_map(out_dir / "map.geojson", topological_map)
 
 
 def write_maps(

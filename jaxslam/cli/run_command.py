@@ -161,11 +161,11 @@ def run(
         numbers["map_consistency"] = consistency.metrics()
         if dead_reckoning:
             numbers["dead_reckoning"] = dead_reckoning
-        report.write_results(out_dir, numbers, laser_log.times, result)
+        poses = result.poses
         if pose_frame == "base":
             base = relative(laser_log.mount, np.zeros(3))  # the robot in the frame of the scanner
-            base_poses = compose(np.asarray(result.poses, np.float64), base)
-            tum.write(out_dir / "trajectory.tum", laser_log.times, base_poses)
+            poses = compose(np.asarray(result.poses, np.float64), base)
+        report.write_results(out_dir, numbers, laser_log.times, poses, result.topological_map)
         measurements = Measurement(
             jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
         )

@@ -66,3 +66,8 @@ def increments(poses: np.ndarray) -> np.ndarray:
     The inverse of `dead_reckoning` from the first pose.
     """
     return np.concatenate([np.zeros((1, 3)), relative(poses[:-1], poses[1:])])
+
+
+def motion_size(increments: np.ndarray) -> np.ndarray:
+    """Sizes (...) [m] of increments (..., 3), of which a radian counts as half a metre."""
+    return np.hypot(increments[..., 0], increments[..., 1]) + 0.5 * np.abs(increments[..., 2])

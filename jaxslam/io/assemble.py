@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import NamedTuple
 
@@ -68,13 +68,12 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
     Args:
         path: The file, for errors.
         raw: What a reader found in it.
-        options: What the user says of it.
+        options: What the user says of it, as `check_options` accepts it.
 
     Raises:
         InputError: There is no scan, or none with odometry where the log has some; a frame is not
-            found; transforms do not join the scanner with the robot; or `options` are impossible.
+            found; or transforms do not join the scanner with the robot.
     """
-    check_options(options)
     raw, notes = _one_scanner(path, raw, options.scan_frame)
     usual = are_usual(raw.scans)
     if not usual.all():
@@ -120,6 +119,24 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
         odometry_stale=track.is_stale,
         mount=mount.pose if raw.mount is None or mount.pose.any() else raw.mount,
     )
+
+
+def read_assembled(
+    path: str | PathLike, read_raw: Callable[[str | PathLike], RawLog], *, range_max: float
+) -> LaserLog:
+    """Read the log of a file, of which the user says nothing but this.
+
+    Args:
+        path: The file.
+        read_raw: The reader of its format.
+        range_max: As of `LogOptions`.
+
+    Raises:
+        InputError: `range_max` is not positive, or as `read_raw` and `assemble`.
+    """
+    options = LogOptions(range_max=range_max)
+    check_options(options)
+    return assemble(path, read_raw(path), options)
 
 
 def _one_scanner(

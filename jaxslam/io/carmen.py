@@ -23,7 +23,7 @@ from jaxslam.core.logs import (
 )
 from jaxslam.core.scan import Lidar
 from jaxslam.io import robotlaser
-from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.assemble import read_assembled
 from jaxslam.io.errors import InputError
 from jaxslam.io.raw_log import RawLog, RawScan, RawTransform, as_odometry
 from jaxslam.io.text import lines, number
@@ -59,9 +59,7 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
         InputError: `range_max` is not positive, the file cannot be read or is no CARMEN log, more
             than 5 % of its lines of scans and odometry are broken, or there is no scan.
     """
-    options = LogOptions(range_max=range_max)
-    check_options(options)
-    return assemble(path, read_raw(path), options)
+    return read_assembled(path, read_raw, range_max=range_max)
 
 
 def read_raw(path: str | PathLike) -> RawLog:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.core.se2_np import relative
+from jaxslam.core.se2_np import motion_size, relative
 from jaxslam.core.time_series import sort_by_time
 from jaxslam.io.raw_log import RawOdometry, Stamps
 
@@ -232,8 +232,7 @@ def _path(poses: np.ndarray) -> float:
 
 def _sizes(poses: np.ndarray) -> np.ndarray:
     """Sizes (N - 1,) [m] of the steps of a path (N, 3); a radian counts as half a metre."""
-    steps = relative(poses[:-1], poses[1:])
-    return np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
+    return motion_size(relative(poses[:-1], poses[1:]))
 
 
 def _overlap(scan_axis: np.ndarray, axis: np.ndarray) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxslam.core.logs import DEFAULT_RANGE_MAX, MAX_BROKEN_FRACTION, LaserLog
 from jaxslam.core.se2_np import dead_reckoning
 from jaxslam.io import robotlaser
-from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.assemble import read_assembled
 from jaxslam.io.errors import InputError
 from jaxslam.io.raw_log import RawLog, RawScan, as_odometry
 from jaxslam.io.text import lines, number
@@ -42,9 +42,7 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
         InputError: `range_max` is not positive, the file cannot be read, has no scan or no odometry
             from one vertex to the next, a vertex or edge is broken, or more than 5 % of the scans.
     """
-    options = LogOptions(range_max=range_max)
-    check_options(options)
-    return assemble(path, read_raw(path), options)
+    return read_assembled(path, read_raw, range_max=range_max)
 
 
 def read_raw(path: str | PathLike) -> RawLog:

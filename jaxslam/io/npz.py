@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.core.logs import DEFAULT_RANGE_STD, LaserLog
-from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.assemble import read_assembled
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
 from jaxslam.io.raw_log import RawLog, RawOdometry, RawScan, Stamps, as_odometry
@@ -100,9 +100,7 @@ def read(path: str | PathLike, *, range_max: float = math.inf) -> LaserLog:
         InputError: `range_max` is not positive; or the file cannot be read, lacks an array, has an
             unknown one, or one of a wrong shape or with values out of range.
     """
-    options = LogOptions(range_max=range_max)
-    check_options(options)
-    return assemble(path, read_raw(path), options)
+    return read_assembled(path, read_raw, range_max=range_max)
 
 
 def read_raw(path: str | PathLike) -> RawLog:

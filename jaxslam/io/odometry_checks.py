@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core.logs import MAX_BROKEN_FRACTION
-from jaxslam.core.se2_np import dead_reckoning, relative
+from jaxslam.core.se2_np import dead_reckoning, motion_size, relative
 from jaxslam.core.time_series import interpolate_poses
 
 # [m], [rad] tolerance of `odometry_jumps`, beyond what `MAX_SPEED` allows
@@ -82,9 +82,8 @@ def missing_spans(times: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """
     steps = np.diff(times)
     motion = relative(poses[:-1], poses[1:])
-    size = np.hypot(motion[:, 0], motion[:, 1]) + 0.5 * np.abs(motion[:, 2])
     usual = float(np.median(steps)) if steps.size else 0.0
-    return (steps > max(MAX_GAP, MAX_GAP_RATIO * usual)) & (size > MIN_GAP_MOTION)
+    return (steps > max(MAX_GAP, MAX_GAP_RATIO * usual)) & (motion_size(motion) > MIN_GAP_MOTION)
 
 
 def is_frozen(poses: np.ndarray) -> bool:
@@ -145,15 +144,12 @@ def _no_odometry(poses: np.ndarray, reason: str) -> CheckedOdometry:
 
 def _restarts(poses: np.ndarray) -> np.ndarray:
     """Steps (N - 1,) bool to where the odometry began, far larger than all others but a few."""
-    steps = relative(poses[:-1], poses[1:])
-    size = np.hypot(steps[:, 0], steps[:, 1]) + 0.5 * np.abs(steps[:, 2])
+    size = motion_size(relative(poses[:-1], poses[1:]))
     if len(size) < MIN_POSES:
         return np.zeros(len(size), bool)
     usual = float(np.quantile(size, 0.95))
-    start = relative(np.broadcast_to(poses[0], poses[1:].shape), poses[1:])
-    from_start = np.hypot(start[:, 0], start[:, 1]) + 0.5 * np.abs(start[:, 2])
-    from_zero = np.hypot(poses[1:, 0], poses[1:, 1]) + 0.5 * np.abs(poses[1:, 2])
-    at_start = np.minimum(from_start, from_zero) <= usual
+    from_start = motion_size(relative(np.broadcast_to(poses[0], poses[1:].shape), poses[1:]))
+    at_start = np.minimum(from_start, motion_size(poses[1:])) <= usual
     return at_start & (size > 10.0 * usual) & (size > 0.1)
 
 

@@ -16,7 +16,7 @@ from os import PathLike
 import numpy as np
 
 from jaxslam.core.logs import DEFAULT_RANGE_MAX, MAX_BROKEN_FRACTION, LaserLog
-from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.assemble import read_assembled
 from jaxslam.io.errors import InputError
 from jaxslam.io.raw_log import RawLog, RawScan, as_odometry
 from jaxslam.io.text import lines, number
@@ -44,9 +44,7 @@ def read(path: str | PathLike, *, range_max: float = DEFAULT_RANGE_MAX) -> Laser
         InputError: `range_max` is not positive, the file cannot be read or has no scans, or more
             than 5 % of its lines of scans and odometry are broken.
     """
-    options = LogOptions(range_max=range_max)
-    check_options(options)
-    return assemble(path, read_raw(path), options)
+    return read_assembled(path, read_raw, range_max=range_max)
 
 
 def is_line(text: bytes) -> bool:

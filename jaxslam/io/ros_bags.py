@@ -8,6 +8,7 @@ robot in `/tf`. The poses of the log are those of the scanner.
 import math
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxslam.core.logs import DEFAULT_RANGE_MAX, MAX_BROKEN_FRACTION, LaserLog
-from jaxslam.io.assemble import LogOptions, assemble, check_options
+from jaxslam.io.assemble import read_assembled
 from jaxslam.io.bag_files import open_bag
 from jaxslam.io.errors import InputError
 from jaxslam.io.mounts import frame_name
@@ -61,10 +62,8 @@ def read(
         InputError: `range_max` is not positive, rosbags is not installed, the bag cannot be read or
             lacks scans, more than 5 % of its scans are broken, or as `assemble`.
     """
-    options = LogOptions(range_max=range_max)
-    check_options(options)
-    raw = read_raw(path, scan_topic=scan_topic, odometry_topic=odometry_topic)
-    return assemble(path, raw, options)
+    of_topics = partial(read_raw, scan_topic=scan_topic, odometry_topic=odometry_topic)
+    return read_assembled(path, of_topics, range_max=range_max)
 
 
 def read_raw(

@@ -136,6 +136,20 @@ class PosePrior(NamedTuple):
     information: Array
 
 
+class MatchedPose(NamedTuple):
+    """A pose of a scan that ICP ended at.
+
+    Attributes:
+        pose: (3,) [m, m, rad] frame of the submap.
+        information: (3, 3) of the scan alone, in the same frame.
+        inlier_fraction: () of its points.
+    """
+
+    pose: Array
+    information: Array
+    inlier_fraction: Array
+
+
 class _Correspondences(NamedTuple):
     """Lines that N points correspond to, on each of K scans.
 
@@ -161,7 +175,7 @@ def icp(
     *,
     gates: tuple[float, ...],
     kernel_scale: float,
-) -> tuple[Array, Array, Array]:
+) -> MatchedPose:
     """Point-to-line ICP of one scan against a submap; the module's docstring has the formulas.
 
         for each gate:
@@ -180,8 +194,8 @@ def icp(
         kernel_scale: [m] scale of the Geman-McClure kernel.
 
     Returns:
-        Pose (3,), its heading not wrapped; information (3, 3) of the scan alone, in the frame of
-        the submap; inlier fraction (), in which a residual e counts exp(-(e / kernel)^2 / 8).
+        The pose, its heading not wrapped; in the inlier fraction a residual e counts
+        exp(-(e / kernel)^2 / 8).
     """
 
     def correspondences(pose: Array, gate: Array) -> _Correspondences:
@@ -205,7 +219,21 @@ def icp(
     error = jnp.sum(pairs.normal * registered[None], axis=-1) - pairs.offset
     inlier = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel_scale) ** 2) / 8), 0.0)
     count = jnp.maximum(jnp.sum(hit, dtype=pose.dtype), 1.0)
-    return pose, information, jnp.sum(jnp.max(inlier, axis=0)) / count
+    return MatchedPose(pose, information, jnp.sum(jnp.max(inlier, axis=0)) / count)
+
+
+def fine_icp(
+    spec: ScanMatchSpec,
+    lidar: Lidar,
+    submap: Submap,
+    prior: PosePrior,
+    start: Array,
+    points: Array,
+    hit: Array,
+) -> MatchedPose:
+    """ICP with close correspondences; arguments as of `icp`."""
+    gates, scale = spec.fine_gates, spec.kernel_scales[1]
+    return icp(spec, lidar, submap, prior, start, points, hit, gates=gates, kernel_scale=scale)
 
 
 def _correspondences(

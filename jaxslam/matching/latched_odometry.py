@@ -9,15 +9,13 @@ whole logs, before SLAM.
 import numpy as np
 
 from jaxslam.core.scan import Scan
+from jaxslam.core.se2_np import motion_size
 
 MAX_LATCHED = 6
 """Increments without motion that a leap is shared out over, at most."""
 
 NEIGHBOURS = 10
 """Increments with motion on either side, whose median is the usual one."""
-
-HEADING_WEIGHT = 0.5
-"""[m] distance that a radian counts as."""
 
 MIN_SHARE = 0.25
 """Least size of a share, of the usual increment's: after a stop a robot starts slowly."""
@@ -46,7 +44,7 @@ def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, int]
     Returns:
         Increments (T, 3) with the same poses after each leap, and the number of leaps.
     """
-    size = np.hypot(odometry[:, 0], odometry[:, 1]) + HEADING_WEIGHT * np.abs(odometry[:, 2])
+    size = motion_size(odometry)
     moving = [int(k) for k in np.flatnonzero(size > 1e-6)]
     shared, num_leaps = odometry.copy(), 0
     for at, leap in enumerate(moving):

@@ -16,7 +16,14 @@ from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.types import Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
-from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
+from jaxslam.matching.icp import (
+    MatchedPose,
+    PosePrior,
+    ScanMatchSpec,
+    Submap,
+    fine_icp,
+    icp,
+)
 from jaxslam.matching.motion_prior import first_history
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
 
@@ -153,7 +160,7 @@ def register_scan(
     coarse_submap = submap._replace(oriented_points=coarse_surfaces, poses=coarse_poses)
     thinned = slice(None, None, scan_matching.coarse_stride)
 
-    def search(start: Array) -> tuple[Array, Array, Array]:
+    def search(start: Array) -> MatchedPose:
         return icp(
             scan_matching,
             lidar,
@@ -175,16 +182,15 @@ def register_scan(
     margin = score[best] - jnp.max(jnp.where(elsewhere, score, -jnp.inf))
 
     facing = _same_side(submap_poses, found[best], surfaces)
-    pose, information, inliers = icp(
+    facing_surfaces = surfaces._replace(valid=surfaces.valid & facing)
+    pose, information, inliers = fine_icp(
         scan_matching,
         lidar,
-        submap._replace(oriented_points=surfaces._replace(valid=surfaces.valid & facing)),
+        submap._replace(oriented_points=facing_surfaces),
         PosePrior(guess, WEAK_PRIOR * guess_information),
         found[best],
         points,
         hit,
-        gates=scan_matching.fine_gates,
-        kernel_scale=scan_matching.kernel_scales[1],
     )
     finite = jnp.all(jnp.isfinite(pose)) & jnp.all(jnp.isfinite(information))
     return Registration(

@@ -33,7 +33,14 @@ from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
-from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
+from jaxslam.matching.icp import (
+    MatchedPose,
+    PosePrior,
+    ScanMatchSpec,
+    Submap,
+    fine_icp,
+    icp,
+)
 from jaxslam.matching.motion_prior import (
     change_variance,
     contradicts,
@@ -43,7 +50,7 @@ from jaxslam.matching.motion_prior import (
     next_history,
 )
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
-from jaxslam.matching.wide_search import fine_icp, search_widely
+from jaxslam.matching.wide_search import search_widely
 
 TURN_PENALTY = 0.005
 """Inlier fraction that a heading 1 std off the odometry must have in addition."""
@@ -203,7 +210,7 @@ def _best_start(
     thinned = slice(None, None, spec.coarse_stride)
     starts = prior.pose[None] + jnp.array([[0.0, 0.0, turn] for turn in spec.heading_guesses])
 
-    def search(start: Array) -> tuple[Array, Array, Array]:
+    def search(start: Array) -> MatchedPose:
         return icp(
             spec,
             lidar,

@@ -13,7 +13,6 @@ With probabilities p, 1 - p and the offset d between the two,
 """
 
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,25 +23,11 @@ from jaxslam.core.se2 import compose, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.matching import correlative
 from jaxslam.matching.correlative import CorrelativeSpec
-from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, icp
+from jaxslam.matching.icp import MatchedPose, PosePrior, ScanMatchSpec, Submap, fine_icp, icp
 from jaxslam.matching.motion_prior import difference
 
 PROBABILITY_SCALE = 0.01
 """Difference of two inlier fractions that makes one place e times as likely as the other."""
-
-
-class MatchedPose(NamedTuple):
-    """A pose of a scan that ICP ended at.
-
-    Attributes:
-        pose: (3,) [m, m, rad] frame of the submap.
-        information: (3, 3) of the scan alone, in the same frame.
-        inlier_fraction: () of its points.
-    """
-
-    pose: Array
-    information: Array
-    inlier_fraction: Array
 
 
 def search_widely(
@@ -88,7 +73,7 @@ def search_widely(
 
     def follow(start: Array) -> MatchedPose:
         prior = PosePrior(start, jnp.diag(1.0 / std**2))
-        found = icp(
+        return icp(
             spec,
             lidar,
             submap,
@@ -99,7 +84,6 @@ def search_widely(
             gates=spec.coarse_gates[-2:],  # a candidate is off by less than a cell
             kernel_scale=spec.kernel_scales[0],
         )
-        return MatchedPose(*found)
 
     followed = jax.vmap(follow)(candidates)
     values = jax.vmap(value)(followed)
@@ -129,18 +113,3 @@ def spread_over(match: MatchedPose, other: Array, advantage: Array) -> Array:
     pull = match.information @ offset
     share = probability * (1.0 - probability)
     return match.information - share * jnp.outer(pull, pull) / (1.0 + share * (offset @ pull))
-
-
-def fine_icp(
-    spec: ScanMatchSpec,
-    lidar: Lidar,
-    submap: Submap,
-    prior: PosePrior,
-    start: Array,
-    points: Array,
-    hit: Array,
-) -> MatchedPose:
-    """ICP with close correspondences; arguments as of `icp`."""
-    gates, scale = spec.fine_gates, spec.kernel_scales[1]
-    found = icp(spec, lidar, submap, prior, start, points, hit, gates=gates, kernel_scale=scale)
-    return MatchedPose(*found)

@@ -34,7 +34,7 @@ class LaserLog(NamedTuple):
         source: Topics that were read, for messages; "" where there is no choice.
         notes: What was wrong with the log and has been corrected, or had to be assumed.
         has_odometry: Whether there is odometry at all; if not, its poses stand still.
-        odometry_stale: (T,) bool, whether the increment of the odometry to a scan is not to be
+        odometry_guessed: (T,) bool, whether the increment of the odometry to a scan is not to be
             trusted: it was lost or interpolated; None if all are to be.
         mount: (3,) [m, m, rad] pose of the scanner in the robot frame (`base_link`), as far as it
             is known; the identity if not.
@@ -50,7 +50,7 @@ class LaserLog(NamedTuple):
     source: str = ""
     notes: tuple[str, ...] = ()
     has_odometry: bool = True
-    odometry_stale: np.ndarray | None = None
+    odometry_guessed: np.ndarray | None = None
     mount: np.ndarray = np.zeros(3)
 
     @classmethod
@@ -102,7 +102,7 @@ class LaserLog(NamedTuple):
             num_skipped=0,
             odom_stream_times=odom_stream_times,
             odom_stream_poses=odom_stream_poses,
-            odometry_stale=np.zeros(times.size, bool),
+            odometry_guessed=np.zeros(times.size, bool),
         )
 
 

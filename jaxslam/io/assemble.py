@@ -116,7 +116,7 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
         source=raw.source,
         notes=tuple(notes),
         has_odometry=track.usable,
-        odometry_stale=track.is_stale,
+        odometry_guessed=track.is_stale,
         mount=mount.pose if raw.mount is None or mount.pose.any() else raw.mount,
     )
 

@@ -58,14 +58,14 @@ def check_scan_match_spec(spec: ScanMatchSpec, name: str = "spec") -> None:
         name: Name of the argument that they came in, for the message.
 
     Raises:
-        ValueError: One is out of range, or there is no gate or no heading to start from.
+        ValueError: One is out of range, or there is no gate.
     """
     check_static(name, spec, ScanMatchSpec)
     for field in ("window_scans", "max_beams", "coarse_scans", "coarse_stride"):
         check_at_least(f"{name}.{field}", getattr(spec, field), 1)
     for field in ("beam_window", "inner_iterations"):
         check_at_least(f"{name}.{field}", getattr(spec, field), 0)
-    for field in ("heading_guesses", "coarse_gates", "fine_gates"):
+    for field in ("coarse_gates", "fine_gates"):
         if len(getattr(spec, field)) == 0:
             raise ValueError(f"{name}.{field} is empty; it takes one number or more")
     check_positive(f"{name}.point_std", spec.point_std)

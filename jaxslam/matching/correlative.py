@@ -17,7 +17,7 @@ References:
     Robotics, section 6.4: likelihood fields.
 """
 
-from functools import partial
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
+from jaxslam.core.se2 import compose, rotation, wrap_angle
 from jaxslam.core.types import Array
 
 
@@ -37,14 +37,13 @@ class CorrelativeSpec(NamedTuple):
         extent: [m] from the guess to the border of the field; points beyond it do not count.
         std: [m] of the field: half a step of heading at some metres, and the walls' own roughness.
         max_displacement: [m] of the window to either side, along each axis.
-        max_turn: [rad] of the window to either side.
+        max_turn: [rad] of the window to either side, where not all headings are searched.
         turn_step: [rad] between two headings.
         max_points: Points of the scan that are used at most, evenly spaced.
         num_candidates: C, poses that are returned.
         distinct: [m], [rad] beyond which two poses are different places.
-        expected_std: [m], [rad] from the nearest pose that was expected, at which
-        penalty: is subtracted from a score; it grows with the square,
-        max_penalty: up to this: a robot may have been carried.
+        score_scale: Score that a pose loses where it is e times less likely than the likeliest.
+        max_penalty: Score that it loses at most: a robot may have been carried.
     """
 
     cell: float = 0.1
@@ -56,8 +55,7 @@ class CorrelativeSpec(NamedTuple):
     max_points: int = 64
     num_candidates: int = 2
     distinct: tuple[float, float] = (0.5, 0.3)
-    expected_std: tuple[float, float] = (0.5, 0.75)
-    penalty: float = 0.1
+    score_scale: float = 0.02
     max_penalty: float = 0.25
 
 
@@ -102,21 +100,30 @@ def likelihood_field(spec: CorrelativeSpec, points: Array, valid: Array) -> Arra
     return field
 
 
-def window_scores(spec: CorrelativeSpec, field: Array, points: Array, hit: Array) -> Array:
-    """Scores (A, S, S) of all headings and displacements of the window.
+def window_scores(
+    spec: CorrelativeSpec, field: Array, points: Array, hit: Array, every_heading: Array
+) -> Array:
+    """Scores (A, S, S) of all headings of a whole turn and all displacements of the window.
 
     Args:
         spec: Options.
         field: (G, G) likelihood field in the frame of the guess.
         points: (P, 2) [m] of the scan, robot frame.
         hit: (P,) bool, those of them that exist.
+        every_heading: () bool; if not, headings further than `spec.max_turn` from the guess's are
+            not looked at, and have no score, -inf.
     """
     half, steps = _half_size(spec), _steps(spec.max_displacement, spec.cell)
     size = 2 * steps + 1
     padded = jnp.pad(field, steps)  # the window of cell (i, j) begins at (i, j)
+    all_headings = headings(spec, field.dtype)
+    middle = len(all_headings) // 2
+    some = min(_steps(spec.max_turn, spec.turn_step), middle)
+    reach = jnp.where(every_heading, jnp.int32(middle), jnp.int32(some))
 
-    def at_heading(heading: Array) -> Array:
-        cell = jnp.round(points @ rotation(heading).T / spec.cell).astype(jnp.int32) + half
+    def at_heading(k: Array, scores: Array) -> Array:
+        turned = points @ rotation(all_headings[k]).T
+        cell = jnp.round(turned / spec.cell).astype(jnp.int32) + half
         inside = hit & jnp.all((cell >= 0) & (cell <= 2 * half), axis=-1)
 
         def add(total: Array, point: tuple[Array, Array]) -> tuple[Array, None]:
@@ -125,17 +132,17 @@ def window_scores(spec: CorrelativeSpec, field: Array, points: Array, hit: Array
             return total + jnp.where(counts, window, 0.0), None
 
         total, _ = lax.scan(add, jnp.zeros((size, size), field.dtype), (cell, inside))
-        return total / jnp.maximum(jnp.sum(hit, dtype=field.dtype), 1.0)
+        return scores.at[k].set(total / jnp.maximum(jnp.sum(hit, dtype=field.dtype), 1.0))
 
-    return lax.map(at_heading, _headings(spec, field.dtype))
+    scores = jnp.full((len(all_headings), size, size), -jnp.inf, field.dtype)
+    return lax.fori_loop(
+        jnp.int32(middle) - reach, jnp.int32(middle + 1) + reach, at_heading, scores
+    )
 
 
-def surprise(spec: CorrelativeSpec, expected: Array, pose: Array) -> Array:
-    """Score () that a pose (3,) loses for its distance from the nearest of poses (E, 3)."""
-    off = pose[None] - expected
-    square = (off[:, 0] ** 2 + off[:, 1] ** 2) / spec.expected_std[0] ** 2
-    square = square + (wrap_angle(off[:, 2]) / spec.expected_std[1]) ** 2
-    return jnp.minimum(spec.penalty * jnp.min(square), spec.max_penalty)
+def surprise(spec: CorrelativeSpec, log_density: Array) -> Array:
+    """Score that poses lose for being unlikely, from the logarithms of their densities."""
+    return jnp.minimum(-spec.score_scale * log_density, spec.max_penalty)
 
 
 def search(
@@ -143,9 +150,10 @@ def search(
     submap: Array,
     valid: Array,
     guess: Array,
-    expected: Array,
+    log_density: Callable[[Array], Array],
     points: Array,
     hit: Array,
+    every_heading: Array,
 ) -> Candidates:
     """The best poses of a scan in a window around a guess.
 
@@ -154,38 +162,46 @@ def search(
         submap: (N, 2) [m] points of the submap.
         valid: (N,) bool, those of them that exist.
         guess: (3,) [m, m, rad] middle of the window, in the frame of the submap.
-        expected: (E, 3) [m, m, rad] poses that are expected; others score less, by `surprise`.
+        log_density: Of a pose (3,) in that frame, before the scan is looked at; () up to a
+            constant. Less likely poses score less, by `surprise`.
         points: (R, 2) [m] of the scan, robot frame.
         hit: (R,) bool, those of them that exist.
+        every_heading: () bool, whether all headings are searched or those of the window.
 
     Returns:
         Candidates in the frame of the submap, their headings not wrapped.
     """
     every = -(-len(points) // spec.max_points)
     field = likelihood_field(spec, (submap - guess[None, :2]) @ rotation(guess[2]), valid)
-    score = window_scores(spec, field, points[::every], hit[::every])
+    score = window_scores(spec, field, points[::every], hit[::every], every_heading)
     offset = spec.cell * jnp.arange(-(score.shape[1] // 2), score.shape[1] // 2 + 1.0)
-    headings = _headings(spec, field.dtype)
-    expected = jax.vmap(relative, in_axes=(None, 0))(guess, expected)
-    grid = jnp.stack(
-        jnp.broadcast_arrays(offset[None, :, None], offset[None, None], headings[:, None, None]),
-        axis=-1,
-    )
-    score = score - jax.vmap(partial(surprise, spec, expected))(grid.reshape(-1, 3)).reshape(
-        score.shape
-    )
+    turn = headings(spec, field.dtype)
+
+    def unlikely(pose: Array) -> Array:
+        return surprise(spec, log_density(compose(guess, pose)))
+
+    def pose_at(k: Array, i: Array, j: Array) -> Array:
+        return jnp.stack([offset[i], offset[j], turn[k]])
+
+    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, score.shape), indexing="ij"), axis=-1)
+    penalty = jax.vmap(lambda at: unlikely(pose_at(*at)))(index.reshape(-1, 3))
+    score = score - penalty.reshape(score.shape)
 
     def take(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-        best = jnp.argmax(left)
-        k, i, j = jnp.unravel_index(best, left.shape)
-        pose = jnp.stack([offset[i], offset[j], headings[k]])
-        near = jnp.hypot(offset[:, None] - pose[0], offset[None] - pose[1]) < spec.distinct[0]
-        turned = jnp.abs(headings - pose[2]) < spec.distinct[1]
+        k, i, j = jnp.unravel_index(jnp.argmax(left), left.shape)
+        near = jnp.hypot(offset[:, None] - offset[i], offset[None] - offset[j]) < spec.distinct[0]
+        turned = jnp.abs(wrap_angle(turn - turn[k])) < spec.distinct[1]
         left = jnp.where(turned[:, None, None] & near[None], -jnp.inf, left)
-        return left, (pose, score[k, i, j])
+        return left, (pose_at(k, i, j), score[k, i, j])
 
     _, (found, value) = lax.scan(take, score, length=spec.num_candidates)
     return Candidates(jax.vmap(compose, in_axes=(None, 0))(guess, found), value)
+
+
+def headings(spec: CorrelativeSpec, dtype: np.dtype) -> Array:
+    """Headings (A,) [rad] of a whole turn, from the guess's, which is in the middle; ascending."""
+    steps = int(np.pi / spec.turn_step)
+    return spec.turn_step * jnp.arange(-steps, steps + 1, dtype=dtype)
 
 
 def _half_size(spec: CorrelativeSpec) -> int:
@@ -196,9 +212,3 @@ def _half_size(spec: CorrelativeSpec) -> int:
 def _steps(most: float, step: float) -> int:
     """Steps to either side of a window."""
     return max(1, round(most / step))
-
-
-def _headings(spec: CorrelativeSpec, dtype: np.dtype) -> Array:
-    """Headings (A,) [rad] of the window, from the guess's; ascending."""
-    steps = _steps(spec.max_turn, spec.turn_step)
-    return spec.turn_step * jnp.arange(-steps, steps + 1, dtype=dtype)

@@ -46,7 +46,6 @@ class ScanMatchSpec(NamedTuple):
         max_beams: Points of a scan that are matched at most, evenly spaced.
         beam_window: Beams on either side of a point's own beam that are searched for its
             correspondence.
-        heading_guesses: [rad] offsets of the initial headings from that of the odometry.
         coarse_scans: Keyframes that the coarse search matches against.
         coarse_stride: Every how many points the coarse search uses one.
         coarse_gates: [m] largest distance of a correspondence, iteration by iteration, in the
@@ -63,7 +62,7 @@ class ScanMatchSpec(NamedTuple):
         max_inlier_drop: Inlier fraction that the quick match may have less than is usual; below, a
             wide window is searched too.
         lost_inliers: Inlier fraction below which all headings are searched.
-        min_gain: Inlier fraction that a pose of the wide search must have in addition.
+        min_gain: Value that a pose of the wide search must have in addition.
         search_std: [m], [rad] std of its candidates, for ICP.
         search: Options of the wide search.
     """
@@ -72,7 +71,6 @@ class ScanMatchSpec(NamedTuple):
     keyframe_distance: tuple[float, float] = (0.1, 0.1)
     max_beams: int = 180
     beam_window: int = 3
-    heading_guesses: tuple[float, ...] = (0.0, 0.15, -0.15, 0.3, -0.3)
     coarse_scans: int = 6
     coarse_stride: int = 4
     coarse_gates: tuple[float, ...] = (0.8, 0.7, 0.6, 0.5, 0.4)
@@ -85,7 +83,7 @@ class ScanMatchSpec(NamedTuple):
     use_odometry: bool = True
     max_inlier_drop: float = 0.1
     lost_inliers: float = 0.3
-    min_gain: float = 0.03
+    min_gain: float = 0.01
     search_std: tuple[float, float] = (0.2, 0.3)
     search: CorrelativeSpec = CorrelativeSpec()
 
@@ -96,13 +94,13 @@ class MotionHistory(NamedTuple):
     Attributes:
         increment: (3,) [m, m, rad] the last increment.
         usual_change: (2,) [m], [rad] running mean of its change from scan to scan.
-        distrust: () 0 to 1, how often of late the wheels contradicted the scans.
+        contradicted: () 0 to 1, how often of late the wheels contradicted the scans.
         usual_inliers: () running mean of the inlier fraction.
     """
 
     increment: Array
     usual_change: Array
-    distrust: Array
+    contradicted: Array
     usual_inliers: Array
 
 

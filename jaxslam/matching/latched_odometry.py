@@ -30,7 +30,7 @@ MIN_CHANGED = 0.3
 """Fraction of the beams that changes where a robot moves; less where only people do."""
 
 
-def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, int]:
+def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.ndarray, int]:
     """Share out the leaps of latched odometry over the scans before them.
 
     A leap is an increment after up to `MAX_LATCHED` increments of no motion at all, if its share is
@@ -42,11 +42,12 @@ def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, int]
         scans: [T], NumPy.
 
     Returns:
-        Increments (T, 3) with the same poses after each leap, and the number of leaps.
+        Increments (T, 3) with the same poses after each leap; (T,) bool, which of them are shares
+        of one; and the number of leaps.
     """
     size = motion_size(odometry)
     moving = [int(k) for k in np.flatnonzero(size > 1e-6)]
-    shared, num_leaps = odometry.copy(), 0
+    shared, is_share, num_leaps = odometry.copy(), np.zeros(len(odometry), bool), 0
     for at, leap in enumerate(moving):
         first = moving[at - 1] + 1 if at else 1
         count = leap - first + 1
@@ -59,8 +60,9 @@ def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, int]
         too_large = size[leap] > MIN_LEAP * usual
         if too_large or _changed_fraction(scans, first - 1, leap - 1) > MIN_CHANGED:
             shared[first : leap + 1] = equal_increments(odometry[leap], count)
+            is_share[first : leap + 1] = True
             num_leaps += 1
-    return shared, num_leaps
+    return shared, is_share, num_leaps
 
 
 def equal_increments(motion: np.ndarray, count: int) -> np.ndarray:

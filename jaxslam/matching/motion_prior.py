@@ -1,29 +1,42 @@
-"""Which motion is expected of a scan: that of the wheels, as far as they have been right of late.
+"""Which motion is expected of a scan: that of the wheels, or one as before where these are wrong.
 
-A robot is heavy: its motion changes little from scan to scan. Where the scans contradict the wheels
-again and again, the motion is expected to be as before; else as the wheels say. Both predictions
-are Gaussian, and are combined by their information:
+Wheels are right nearly always, to a few centimetres; and sometimes they are wrong by anything: they
+slip, hang, or repeat old values. A robot is heavy, so then its motion is about as it was from the
+scan before to the last one. With the probability o that the wheels are wrong, the pose of the scan
+has the density
 
-    distrust = running mean of "the scan contradicted the wheels"
-    information = (1 - distrust) / std_odometry^2 + distrust / std_change^2
+    p(pose) = (1 - o) t(pose; as the wheels say) + o t(pose; as before)
 
-where std_change is twice the usual change of the motion from scan to scan.
+of two Student t distributions, as either is now and then off by several standard deviations. Here o
+is how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, and
+`GUESSED_OUTLIER` where the log itself says that an increment is a guess. The quick match needs one
+Gaussian near the right place: both are combined by their information, weighted by 1 - o and o.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxslam.core.se2 import wrap_angle
+from jaxslam.core.se2 import compose, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.matching.icp import MotionHistory, ScanMatchSpec
-from jaxslam.matching.odometry_fusion import mount_cov
+from jaxslam.matching.odometry_fusion import DEGREES_OF_FREEDOM, mount_cov
 
 MEMORY = 0.9
 """Weight of the past in the running means of what is usual: ten scans."""
 
-DISTRUST_MEMORY = 0.8
+OUTLIER_MEMORY = 0.8
 """The same for contradictions: five scans."""
+
+MIN_OUTLIER = 0.01
+"""Least probability that the wheels are wrong."""
+
+GUESSED_OUTLIER = 0.5
+"""Probability that an increment is wrong which the log itself only guesses."""
+
+MIN_CONTRADICTED = 0.3
+"""How often the wheels were contradicted of late, from which on they may be wrong again: two scans
+of the last five."""
 
 MAX_STD = 3.0
 """Standard deviations beyond which an increment contradicts what was expected."""
@@ -33,6 +46,20 @@ LEAST_CHANGE = (0.02, 0.02)
 
 FIRST_CHANGE = (0.1, 0.1)
 """[m], [rad] usual change before there is any: robots of these logs accelerate by 1 m/s^2."""
+
+
+class WheelMotion(NamedTuple):
+    """What the wheels say of the motion since the scan before.
+
+    Attributes:
+        increment: (3,) [m, m, rad] in the frame of the pose before.
+        variance: (3,) [m^2, m^2, rad^2] of it where they are right.
+        outlier_probability: () 0 to 1, that they are wrong.
+    """
+
+    increment: Array
+    variance: Array
+    outlier_probability: Array
 
 
 class ExpectedMotion(NamedTuple):
@@ -49,28 +76,88 @@ class ExpectedMotion(NamedTuple):
     odometry_weight: Array
 
 
+class PoseHypotheses(NamedTuple):
+    """Density of the pose of a scan before it is matched: a mixture of E Student t distributions.
+
+    Attributes:
+        poses: (E, 3) [m, m, rad] their means, in the frame of the submap.
+        variances: (E, 3) [m^2, m^2, rad^2] their squared scales along and across the robot's
+            heading before, and of the turn.
+        weights: (E,) their probabilities.
+        heading: () [rad] of the robot before, in the frame of the submap.
+    """
+
+    poses: Array
+    variances: Array
+    weights: Array
+    heading: Array
+
+
 def first_history() -> MotionHistory:
     """Before the first scan: a robot at rest, and wheels that are trusted."""
     return MotionHistory(jnp.zeros(3), jnp.array(FIRST_CHANGE), jnp.zeros(()), jnp.ones(()))
 
 
-def expected_motion(
-    spec: ScanMatchSpec, history: MotionHistory, odometry: Array, distrust: Array
-) -> ExpectedMotion:
-    """Expected increment of the next scan.
+def wheel_motion(
+    spec: ScanMatchSpec, history: MotionHistory, odometry: Array, guessed: Array
+) -> WheelMotion:
+    """The wheels' increment, how far off it may be, and how likely it is wrong.
 
     Args:
-        spec: Options; without `use_odometry` the motion is expected to be as before.
+        spec: Options; without `use_odometry` the wheels are wrong for certain.
         history: Of the scans before.
         odometry: (3,) [m, m, rad] increment by the wheels.
-        distrust: () 0 to 1, of these wheels.
+        guessed: () bool, whether the log only guesses it, as a share of a longer motion: it is then
+            off by the usual change from scan to scan as well.
     """
-    weight = 1.0 - distrust if spec.use_odometry else jnp.zeros_like(distrust)
-    by_wheels = weight / odometry_variance(spec, odometry)
+    if not spec.use_odometry:
+        return WheelMotion(history.increment, change_variance(history), jnp.ones(()))
+    variance = odometry_variance(spec, odometry)
+    variance = jnp.where(guessed, variance + change_variance(history), variance)
+    least = jnp.where(guessed, GUESSED_OUTLIER, 0.0)
+    return WheelMotion(odometry, variance, jnp.maximum(history.contradicted, least))
+
+
+def expected_motion(history: MotionHistory, wheels: WheelMotion) -> ExpectedMotion:
+    """Expected increment of the next scan, as one Gaussian.
+
+    Args:
+        history: Of the scans before.
+        wheels: What the wheels say.
+    """
+    weight = 1.0 - wheels.outlier_probability
+    by_wheels = weight / wheels.variance
     as_before = (1.0 - weight) / change_variance(history)
     information = by_wheels + as_before
-    change = difference(odometry, history.increment)
-    return ExpectedMotion(odometry + as_before / information * change, information, weight)
+    change = difference(wheels.increment, history.increment)
+    return ExpectedMotion(wheels.increment + as_before / information * change, information, weight)
+
+
+def pose_hypotheses(history: MotionHistory, wheels: WheelMotion, before: Array) -> PoseHypotheses:
+    """Density of the pose of the next scan; the module's docstring has the formula.
+
+    Args:
+        history: Of the scans before.
+        wheels: What the wheels say.
+        before: (3,) [m, m, rad] pose of the scan before.
+    """
+    outlier = jnp.maximum(wheels.outlier_probability, MIN_OUTLIER)
+    poses = jnp.stack([compose(before, wheels.increment), compose(before, history.increment)])
+    variances = jnp.stack([wheels.variance, change_variance(history)])
+    return PoseHypotheses(poses, variances, jnp.stack([1.0 - outlier, outlier]), before[2])
+
+
+def log_density(hypotheses: PoseHypotheses, pose: Array) -> Array:
+    """Logarithm () of the density at a pose (3,), relative to the greatest of one of its parts."""
+    off = pose[None] - hypotheses.poses
+    cos, sin = jnp.cos(hypotheses.heading), jnp.sin(hypotheses.heading)
+    along, across = cos * off[:, 0] + sin * off[:, 1], cos * off[:, 1] - sin * off[:, 0]
+    off = jnp.stack([along, across, wrap_angle(off[:, 2])], axis=-1)
+    square = jnp.sum(off**2 / hypotheses.variances, axis=-1)
+    peak = jnp.log(hypotheses.weights) - 0.5 * jnp.sum(jnp.log(hypotheses.variances), axis=-1)
+    tail = -0.5 * (DEGREES_OF_FREEDOM + 3.0) * jnp.log1p(square / DEGREES_OF_FREEDOM)
+    logs = peak - jnp.max(peak) + tail
+    return jnp.max(logs) + jnp.log(jnp.sum(jnp.exp(logs - jnp.max(logs))))
 
 
 def odometry_variance(spec: ScanMatchSpec, odometry: Array) -> Array:
@@ -85,17 +172,25 @@ def change_variance(history: MotionHistory) -> Array:
     return _per_axis(2.0 * history.usual_change) ** 2
 
 
-def is_leap(history: MotionHistory, odometry: Array) -> Array:
-    """Whether trusted wheels report a change of the motion far beyond what is usual; () bool."""
-    change = magnitude(difference(history.increment, odometry))
+def need_a_look(spec: ScanMatchSpec, history: MotionHistory, wheels: WheelMotion) -> Array:
+    """Whether wheels are not to be followed without a look around; () bool.
+
+    Trusted wheels report a change of the motion far beyond what is usual; or they were contradicted
+    of late, and rule out the motion before.
+    """
+    if not spec.use_odometry:
+        return jnp.zeros((), bool)
+    change = magnitude(difference(history.increment, wheels.increment))
     far = change > MAX_STD * (history.usual_change + jnp.array(LEAST_CHANGE))
-    return jnp.any(far) & (history.distrust < 0.5)
+    leap = jnp.any(far) & (wheels.outlier_probability < GUESSED_OUTLIER)
+    again = (history.contradicted > MIN_CONTRADICTED) & contradicts(wheels, history.increment)
+    return leap | again
 
 
-def contradicts(spec: ScanMatchSpec, odometry: Array, increment: Array) -> Array:
+def contradicts(wheels: WheelMotion, increment: Array) -> Array:
     """Whether an increment (3,) of the scans is one that the wheels rule out; () bool."""
-    off = difference(odometry, increment)
-    return jnp.any(off**2 > MAX_STD**2 * odometry_variance(spec, odometry))
+    off = difference(wheels.increment, increment)
+    return jnp.any(off**2 > MAX_STD**2 * wheels.variance)
 
 
 def next_history(
@@ -109,7 +204,7 @@ def next_history(
     return MotionHistory(
         increment,
         MEMORY * history.usual_change + (1.0 - MEMORY) * change,
-        DISTRUST_MEMORY * history.distrust + (1.0 - DISTRUST_MEMORY) * contradiction,
+        OUTLIER_MEMORY * history.contradicted + (1.0 - OUTLIER_MEMORY) * contradiction,
         MEMORY * history.usual_inliers + (1.0 - MEMORY) * inlier_fraction,
     )
 

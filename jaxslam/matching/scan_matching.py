@@ -1,59 +1,49 @@
 """Scan matching: odometry from laser scans by point-to-line ICP against a sliding submap.
 
 The submap holds the points of the last keyframe scans, with the normals of the surfaces they are
-on. A scan is registered where its points are on these surfaces. ICP starts from several headings
-around that of the odometry, as wheels slip most where a robot turns. The odometry is also a weak
-prior, which keeps directions that the scans do not constrain, such as along a bare corridor.
+on. A scan is registered where its points are on these surfaces, by ICP from the pose that is
+expected. That is also a weak prior, which keeps directions that the scans do not constrain, such as
+along a bare corridor.
 
-Wheels may be wrong by far more than that: they slip, hang, or repeat old values. Where this quick
-match explains less of the scan than usual, contradicts the wheels, or the wheels leap,
-`wide_search` looks further. Wheels that are contradicted again and again are trusted less
-(`motion_prior`); with `use_odometry=False` they are not used at all.
+Wheels may be wrong by far more than ICP reaches: they slip, hang, or repeat old values. Where this
+quick match explains less of the scan than usual or contradicts the wheels, or the wheels leap or
+are only guessed, `wide_search` looks further. Wheels that are contradicted again and again are
+trusted less (`motion_prior`); with `use_odometry=False` they are not used at all.
 The information returned with each increment is that of the scans alone; `odometry_fusion` combines
 both. `icp` has the formulas.
 
     submap = empty_submap(spec, lidar)
     submap, match = match_scan(spec, lidar, submap, scan, odometry)      # one scan
     submap, matches = match_scans(spec, lidar, submap, scans, odometry)  # T scans, compiled
-
-References:
-    Olson (2009), Real-time correlative scan matching: a search over headings.
 """
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxslam.core import trace_cache
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
-from jaxslam.core.types import AnyArray, Array
+from jaxslam.core.types import AnyArray, Array, as_bool
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
-from jaxslam.matching.icp import (
-    MatchedPose,
-    PosePrior,
-    ScanMatchSpec,
-    Submap,
-    fine_icp,
-    icp,
-)
+from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, fine_icp, icp
 from jaxslam.matching.motion_prior import (
+    need_a_look,
     change_variance,
     contradicts,
     expected_motion,
     first_history,
-    is_leap,
     next_history,
+    pose_hypotheses,
+    wheel_motion,
 )
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
 from jaxslam.matching.wide_search import search_widely
-
-TURN_PENALTY = 0.005
-"""Inlier fraction that a heading 1 std off the odometry must have in addition."""
 
 
 def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
@@ -74,19 +64,23 @@ def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
 
 
 def match_scan(
-    spec: ScanMatchSpec, lidar: Lidar, submap: Submap, scan: Scan, odometry: AnyArray
+    spec: ScanMatchSpec,
+    lidar: Lidar,
+    submap: Submap,
+    scan: Scan,
+    odometry: AnyArray,
+    *,
+    guessed: AnyArray | bool = False,
 ) -> tuple[Submap, ScanMatch]:
     """Match one scan, coarse to fine, and add it to the submap if it is a keyframe.
 
         1. Predict the pose by odometry, as far as it is trusted; its std grows with the motion, by
            `spec.odometry_slip`.
-        2. Coarse search: ICP from each of `spec.heading_guesses`, of few points to recent
-           keyframes.
-        3. Keep the start of the largest inlier fraction, less a penalty on its turn.
-        4. Refine: ICP of all points to all keyframes, with closer correspondences.
-        5. If this explains little, or contradicts the wheels, search a wide window as well. Under
-           `jax.vmap` that is computed for every scan, whether needed or not.
-        6. If the result is not finite, the predicted pose and no information.
+        2. Coarse: ICP of few points to recent keyframes, with far correspondences.
+        3. Fine: ICP of all points to all keyframes, with close ones.
+        4. If this explains little, contradicts the wheels, or these are not to be trusted, search a
+           wide window as well. Under `jax.vmap` that is computed for every scan, needed or not.
+        5. If the result is not finite, the predicted pose and no information.
 
     It is one step, for robots online: call it by `jax.jit(match_scan, static_argnums=(0, 1))`.
 
@@ -96,6 +90,7 @@ def match_scan(
         submap: The submap of the scans before.
         scan: One scan.
         odometry: (3,) [m, m, rad] odometry increment since the scan before.
+        guessed: () bool, whether that is a guess of the reader, not what the wheels said.
 
     Returns:
         The submap after the scan, and the increment that the scan matcher finds.
@@ -107,7 +102,8 @@ def match_scan(
     submap = checks.as_submap(spec, lidar, submap)
     odometry = checks.as_default_float("odometry", odometry, (3,))
     scan = checks.as_scans("scan", lidar, scan)
-    return _match_scan(spec, lidar, submap, scan, odometry)
+    guessed = as_bool("guessed", guessed, ())
+    return _match_scan(spec, lidar, submap, scan, odometry, guessed)
 
 
 def match_scans(
@@ -117,6 +113,8 @@ def match_scans(
     scans: Scan,
     odometry: AnyArray,
     count: AnyArray | int | None = None,
+    *,
+    guessed: AnyArray | None = None,
 ) -> tuple[Submap, ScanMatch]:
     """Match scans [T] one after the other; return the submap after them, and increments [T].
 
@@ -132,6 +130,8 @@ def match_scans(
             of all.
         count: () int number of scans that exist, the first ones; None for all. The others are
             padding and leave the submap as it is.
+        guessed: (T,) bool, which increments are guesses of the reader, not what the wheels said;
+            None for none.
 
     Raises:
         ValueError: Scans, odometry or submap are not those of this lidar and these options, there
@@ -143,31 +143,41 @@ def match_scans(
     scans = checks.as_scans("scans", lidar, scans, odometry.shape[:1])
     if count is not None:
         count = checks.as_count("count", count, len(odometry))
-    return _match_scans(spec, lidar, submap, scans, odometry, count)
+    if guessed is None:
+        guessed = np.zeros(len(odometry), bool)
+    guessed = as_bool("guessed", guessed, odometry.shape[:1])
+    return _match_scans(spec, lidar, submap, scans, odometry, guessed, count)
 
 
 def _match_scan(
-    spec: ScanMatchSpec, lidar: Lidar, submap: Submap, scan: Scan, odometry: Array
+    spec: ScanMatchSpec, lidar: Lidar, submap: Submap, scan: Scan, odometry: Array, guessed: Array
 ) -> tuple[Submap, ScanMatch]:
     """`match_scan` of what has been checked."""
     every = -(-lidar.num_beams // spec.max_beams)
     points, hit = beam_ends(lidar, scan)[::every], scan.hit[::every]
     before, history = submap.last_pose, submap.motion
-    if not spec.use_odometry:
-        odometry = history.increment
-    motion = expected_motion(spec, history, odometry, history.distrust)
+    wheels = wheel_motion(spec, history, odometry, guessed)
+    motion = expected_motion(history, wheels)
     turn = jnp.eye(3).at[:2, :2].set(rotation(before[2]))  # from the frame of the pose before
     information = turn @ jnp.diag(motion.information) @ turn.T
     prior = PosePrior(compose(before, motion.increment), information)
 
-    start = _best_start(spec, lidar, submap, prior, 1.0 / motion.information[2], points, hit)
+    start = _coarse_pose(spec, lidar, submap, prior, points, hit)
     quick = fine_icp(spec, lidar, submap, prior, start, points, hit)
     explains_little = quick.inlier_fraction < history.usual_inliers - spec.max_inlier_drop
-    odd = explains_little | is_leap(history, odometry)
-    odd |= contradicts(spec, odometry, relative(before, quick.pose))
+    odd = explains_little | guessed | need_a_look(spec, history, wheels)
+    odd |= contradicts(wheels, relative(before, quick.pose))
     match = lax.cond(
         odd & (submap.num_added > 0),
-        partial(search_widely, spec, lidar, submap, odometry, points, hit),
+        lambda quick: search_widely(
+            spec,
+            lidar,
+            submap,
+            pose_hypotheses(history, wheels, before),
+            points,
+            hit,
+            quick,
+        ),
         lambda quick: quick,
         quick,
     )
@@ -176,9 +186,9 @@ def _match_scan(
     pose = pose.at[2].set(wrap_angle(pose[2]))
     information = jnp.where(finite, match.information, 0.0)
     increment = relative(before, pose)
-    contradicted = contradicts(spec, odometry, increment)
-    distrust = jnp.where(contradicted, 1.0, history.distrust)
-    expected = expected_motion(spec, history, odometry, distrust)
+    contradicted = contradicts(wheels, increment)
+    outlier = jnp.where(contradicted, 1.0, wheels.outlier_probability)
+    expected = expected_motion(history, wheels._replace(outlier_probability=outlier))
     result = ScanMatch(
         increment,
         turn.T @ information @ turn,
@@ -191,41 +201,27 @@ def _match_scan(
     return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), result
 
 
-def _best_start(
-    spec: ScanMatchSpec,
-    lidar: Lidar,
-    submap: Submap,
-    prior: PosePrior,
-    heading_variance: Array,
-    points: Array,
-    hit: Array,
+def _coarse_pose(
+    spec: ScanMatchSpec, lidar: Lidar, submap: Submap, prior: PosePrior, points: Array, hit: Array
 ) -> Array:
-    """Pose (3,) that the coarse search of `match_scan` ends at."""
+    """Pose (3,) that the coarse ICP of `match_scan` ends at."""
     age = jnp.arange(min(spec.coarse_scans, spec.window_scans), dtype=jnp.int32)
     recent_slots = (submap.num_added - 1 - age) % spec.window_scans
     surfaces, poses = jax.tree.map(
         lambda x: x[recent_slots], (submap.oriented_points, submap.poses)
     )
-    recent = submap._replace(oriented_points=surfaces, poses=poses)
     thinned = slice(None, None, spec.coarse_stride)
-    starts = prior.pose[None] + jnp.array([[0.0, 0.0, turn] for turn in spec.heading_guesses])
-
-    def search(start: Array) -> MatchedPose:
-        return icp(
-            spec,
-            lidar,
-            recent,
-            prior,
-            start,
-            points[thinned],
-            hit[thinned],
-            gates=spec.coarse_gates,
-            kernel_scale=spec.kernel_scales[0],
-        )
-
-    poses, _, inlier_fraction = jax.vmap(search)(starts)
-    turned = wrap_angle(poses[:, 2] - prior.pose[2])
-    return poses[jnp.argmax(inlier_fraction - TURN_PENALTY * turned**2 / heading_variance)]
+    return icp(
+        spec,
+        lidar,
+        submap._replace(oriented_points=surfaces, poses=poses),
+        prior,
+        prior.pose,
+        points[thinned],
+        hit[thinned],
+        gates=spec.coarse_gates,
+        kernel_scale=spec.kernel_scales[0],
+    ).pose
 
 
 def _add_keyframe(
@@ -258,6 +254,7 @@ def _match_scans(
     submap: Submap,
     scans: Scan,
     odometry: Array,
+    guessed: Array,
     count: Array | None,
 ) -> tuple[Submap, ScanMatch]:
     """`match_scans` of what has been checked."""
@@ -265,9 +262,9 @@ def _match_scans(
         len(odometry) if count is None else count
     )
 
-    def body(submap: Submap, now: tuple[Scan, Array, Array]) -> tuple[Submap, ScanMatch]:
-        scan, odometry, exists = now
-        after, match = _match_scan(spec, lidar, submap, scan, odometry)
+    def body(submap: Submap, now: tuple[Scan, Array, Array, Array]) -> tuple[Submap, ScanMatch]:
+        scan, odometry, guessed, exists = now
+        after, match = _match_scan(spec, lidar, submap, scan, odometry, guessed)
         return jax.tree.map(partial(jnp.where, exists), after, submap), match
 
-    return lax.scan(body, submap, (scans, odometry, exists))
+    return lax.scan(body, submap, (scans, odometry, guessed, exists))

@@ -2,12 +2,17 @@
 
 The quick match finds what lies near the prediction. Here the pose may be anywhere in a window of a
 metre and a radian to either side, or of a whole turn where nothing fits. The candidates are refined
-by ICP; the best of them takes the place of the quick match if it explains clearly more of the scan.
-Poses far from what wheels or the motion before say are less likely, and have to explain more.
+by ICP. Quick match and candidates are compared by
 
-Where two places explain the scan about as well, the better one is kept, and the information is that
-of a Gaussian with the mean and covariance of both: small in the direction from one to the other.
-With probabilities p, 1 - p and the offset d between the two,
+    value = (inliers - contradictions) / 2 - surprise
+
+where inliers are the points that lie on surfaces of the submap, contradictions those in space that
+its scans saw to be free, both as fractions; the surprise grows with the distance from where wheels
+or the motion before would have the robot (`motion_prior`).
+
+Where two places have about the same value, the better one is kept, and the information is that of a
+Gaussian with the mean and covariance of both: small in the direction from one to the other. With
+probabilities p, 1 - p and the offset d between the two,
 
     cov' = H^-1 + p (1 - p) d d^T        H' = H - H d (H d)^T / (1 / (p (1 - p)) + d^T H d)
 """
@@ -16,25 +21,32 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxslam.core.scan import Lidar
-from jaxslam.core.se2 import compose, wrap_angle
+from jaxslam.core.se2 import transform, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.matching import correlative
-from jaxslam.matching.correlative import CorrelativeSpec
-from jaxslam.matching.icp import MatchedPose, PosePrior, ScanMatchSpec, Submap, fine_icp, icp
-from jaxslam.matching.motion_prior import difference
+from jaxslam.matching.icp import MatchedPose, PosePrior, ScanMatchSpec, Submap, fine_icp
+from jaxslam.matching.motion_prior import PoseHypotheses, log_density
+from jaxslam.matching.oriented_points import OrientedPoints
 
 PROBABILITY_SCALE = 0.01
-"""Difference of two inlier fractions that makes one place e times as likely as the other."""
+"""Difference of two values that makes one place e times as likely as the other."""
+
+SAME_PLACE = (0.1, 0.05)
+"""[m], [rad] within which two refined poses are one place."""
+
+FREE_MARGIN = 0.3
+"""[m] from which on a point before a surface is in free space."""
 
 
 def search_widely(
     spec: ScanMatchSpec,
     lidar: Lidar,
     submap: Submap,
-    odometry: Array,
+    hypotheses: PoseHypotheses,
     points: Array,
     hit: Array,
     quick: MatchedPose,
@@ -45,58 +57,95 @@ def search_widely(
         spec: Options.
         lidar: The scanner.
         submap: Of the scans before.
-        odometry: (3,) [m, m, rad] increment by the wheels.
+        hypotheses: Where the scan is expected.
         points: (N, 2) [m] of the scan, robot frame.
         hit: (N,) bool, those of them that exist.
         quick: The quick match.
     """
-    last, wide = submap.motion.increment, spec.search
-    as_wheels_or_before = jnp.stack([odometry, last])
-    expected = jax.vmap(compose, in_axes=(None, 0))(submap.last_pose, as_wheels_or_before)
-    middle = compose(submap.last_pose, odometry + difference(odometry, last) / 2)
     surfaces = submap.oriented_points
-    cloud, valid = surfaces.points.reshape(-1, 2), surfaces.valid.ravel()
-
-    def look(window: CorrelativeSpec) -> Array:
-        return correlative.search(window, cloud, valid, middle, expected, points, hit).poses
-
-    candidates = lax.cond(
-        quick.inlier_fraction < spec.lost_inliers,
-        lambda: look(wide._replace(max_turn=jnp.pi)),
-        lambda: look(wide),
+    first, second = hypotheses.poses
+    turn = wrap_angle(second[2] - first[2])
+    middle = jnp.stack(
+        [(first[0] + second[0]) / 2, (first[1] + second[1]) / 2, first[2] + turn / 2]
     )
-    std = jnp.array([spec.search_std[0], spec.search_std[0], spec.search_std[1]])
-    thinned = slice(None, None, spec.coarse_stride)
+    candidates = correlative.search(
+        spec.search,
+        surfaces.points.reshape(-1, 2),
+        surfaces.valid.ravel(),
+        middle,
+        partial(log_density, hypotheses),
+        points,
+        hit,
+        quick.inlier_fraction < spec.lost_inliers,
+    ).poses
+    information = jnp.diag(
+        1.0 / jnp.array([spec.search_std[0], spec.search_std[0], spec.search_std[1]]) ** 2
+    )
+
+    def refine(start: Array) -> MatchedPose:
+        prior = PosePrior(start, information)
+        return fine_icp(spec, lidar, submap, prior, start, points, hit)
+
+    refined = lax.map(refine, jnp.concatenate([candidates, hypotheses.poses]))
+    found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), quick, refined)
 
     def value(match: MatchedPose) -> Array:
-        return match.inlier_fraction - correlative.surprise(wide, expected, match.pose)
-
-    def follow(start: Array) -> MatchedPose:
-        prior = PosePrior(start, jnp.diag(1.0 / std**2))
-        return icp(
-            spec,
-            lidar,
-            submap,
-            prior,
-            start,
-            points[thinned],
-            hit[thinned],
-            gates=spec.coarse_gates[-2:],  # a candidate is off by less than a cell
-            kernel_scale=spec.kernel_scales[0],
+        contradicted = contradicted_fraction(
+            lidar, surfaces, submap.poses, transform(match.pose, points), hit
         )
+        unlikely = correlative.surprise(spec.search, log_density(hypotheses, match.pose))
+        return (match.inlier_fraction - contradicted) / 2 - unlikely
 
-    followed = jax.vmap(follow)(candidates)
-    values = jax.vmap(value)(followed)
-    best, second = lax.top_k(values, 2)[1]
-    start, runner_up = followed.pose[best], followed.pose[second]
-    prior = PosePrior(start, jnp.diag(1.0 / std**2))
-    found = fine_icp(spec, lidar, submap, prior, start, points, hit)
-    found = found._replace(information=spread_over(found, runner_up, values[second] - values[best]))
+    values = jax.vmap(value)(found).at[0].add(spec.min_gain)
+    values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
+    match = jax.tree.map(lambda x: x[jnp.argmax(values)], found)
+    off = found.pose - match.pose[None]
+    near = jnp.hypot(off[:, 0], off[:, 1]) < SAME_PLACE[0]
+    same = near & (jnp.abs(wrap_angle(off[:, 2])) < SAME_PLACE[1])
+    elsewhere = jnp.where(same, -jnp.inf, values)
+    other = found.pose[jnp.argmax(elsewhere)]
+    behind = jnp.max(elsewhere) - jnp.max(values)
+    return match._replace(information=spread_over(match, other, behind))
 
-    gain = value(found) - value(quick) - spec.min_gain
-    match = jax.tree.map(partial(jnp.where, gain > 0.0), found, quick)
-    other = jnp.where(gain > 0.0, quick.pose, found.pose)
-    return match._replace(information=spread_over(match, other, -jnp.abs(gain)))
+
+def contradicted_fraction(
+    lidar: Lidar, surfaces: OrientedPoints, poses: Array, points: Array, hit: Array
+) -> Array:
+    """Fraction () of the points that lie in space which the keyframes saw to be free.
+
+    A point is in free space of a keyframe if it is nearer than all surfaces that this saw around
+    its bearing, by `FREE_MARGIN`; each point counts by the share of such keyframes, of those that
+    saw a surface there.
+
+    Args:
+        lidar: The scanner.
+        surfaces: [K] of the keyframes, in the frame of the points.
+        poses: (K, 3) [m, m, rad] of the keyframes.
+        points: (N, 2) [m].
+        hit: (N,) bool, those of them that exist.
+    """
+    middle = lidar.angle_min + lidar.angle_increment * (lidar.num_beams - 1) / 2
+
+    def in_free_space(surface: OrientedPoints, pose: Array) -> tuple[Array, Array]:
+        distance = jnp.linalg.norm(surface.points - pose[None, :2], axis=-1)
+        away = points - pose[None, :2]
+        bearing = wrap_angle(jnp.arctan2(away[:, 1], away[:, 0]) - pose[2] - middle)
+        beam = jnp.round(bearing / lidar.angle_increment + (lidar.num_beams - 1) / 2)
+        around = beam.astype(jnp.int32)[:, None] + jnp.arange(-1, 2, dtype=jnp.int32)[None]
+        inside = jnp.all((around >= 0) & (around < lidar.num_beams), axis=-1)
+        around = around.clip(0, lidar.num_beams - 1)
+        seen = inside & jnp.all(surface.valid[around], axis=-1)
+        nearest = jnp.min(distance[around], axis=-1)
+        return seen, seen & (jnp.linalg.norm(away, axis=-1) < nearest - FREE_MARGIN)
+
+    seen, free = jax.vmap(in_free_space)(surfaces, poses)
+    share = _fraction(jnp.sum(free, axis=0), jnp.sum(seen, axis=0), points.dtype)
+    return _fraction(jnp.sum(jnp.where(hit, share, 0.0)), jnp.sum(hit), points.dtype)
+
+
+def _fraction(part: Array, whole: Array, dtype: np.dtype) -> Array:
+    """Part / whole of numbers, 0 where there is nothing."""
+    return part.astype(dtype) / jnp.maximum(whole, 1).astype(dtype)
 
 
 def spread_over(match: MatchedPose, other: Array, advantage: Array) -> Array:
@@ -105,7 +154,7 @@ def spread_over(match: MatchedPose, other: Array, advantage: Array) -> Array:
     Args:
         match: The match.
         other: (3,) [m, m, rad] the other pose.
-        advantage: () difference of inlier fractions by which the other one is better; negative.
+        advantage: () difference of values by which the other one is better; negative.
     """
     probability = jax.nn.sigmoid(advantage / PROBABILITY_SCALE)
     offset = other - match.pose

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import as_float64, check_array, check_type
+from jaxslam.core.types import as_bool, as_float64, check_array, check_type
 from jaxslam.filtering.inputs import check_params
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.lidar import to_scan
@@ -74,6 +74,17 @@ def as_log_odometry(odometry: Any, *, name: str = "odometry") -> np.ndarray:
             f"consecutive ones differ by {longest_step:.2f} m at most; {INCREMENTS}"
         )
     return increments
+
+
+def as_guessed(guessed: Any, num_scans: int) -> np.ndarray:
+    """Which increments of the odometry are guesses, (T,) bool; none where None is given.
+
+    Raises:
+        ValueError: They are no bools, or not as many as scans.
+    """
+    if guessed is None:
+        return np.zeros(num_scans, bool)
+    return np.array(as_bool("odometry_guessed", guessed, (num_scans,)))
 
 
 def as_scans(lidar: Lidar, ranges: Any, num_scans: int) -> Scan:

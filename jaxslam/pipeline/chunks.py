@@ -140,7 +140,11 @@ def padded_chunk(odometry: np.ndarray, scans: Scan) -> tuple[Scan, Array, Array]
 
 
 def extract_chunk(
-    config: Config, submap: Submap | None, odometry: np.ndarray, scans: Scan
+    config: Config,
+    submap: Submap | None,
+    odometry: np.ndarray,
+    scans: Scan,
+    guessed: np.ndarray | None = None,
 ) -> Chunk:
     """Features, arcs and, with a submap of the scan matcher, matched increments of a chunk.
 
@@ -149,8 +153,11 @@ def extract_chunk(
         submap: After the chunk before; None if scans are not matched.
         odometry: (N, 3) [m, m, rad] increments, NumPy.
         scans: [N], NumPy.
+        guessed: (N,) bool, which increments are guesses; None for none.
     """
     padded_scans, increments, count = padded_chunk(odometry, scans)
+    if guessed is not None:
+        guessed = pad_to(guessed, to=CHUNK)
     matches = None
     with ThreadPoolExecutor(1) as worker:  # beside the matching, see the module's diagram
         run = with_settings(extract.extract_local_graphs)
@@ -163,6 +170,7 @@ def extract_chunk(
                 padded_scans,
                 increments,
                 count,
+                guessed=guessed,
             )
         features, local_arcs = extracted.result()
     measurements = Measurement(increments, features, scan_match=matches)

@@ -199,7 +199,13 @@ def episode_from_laser_log(
         truth[i], truth_mask[i], begin = poses[j], True, int(i.min())
     increments = se2_np.increments(odometry[begin:])
     scans = to_scan(config.frontend.lidar, jnp.asarray(ranges[begin:], float))
-    matched = online.match_log(config, increments, scans) if match_scans else None
+    guessed = laser_log.odometry_guessed
+    guessed = None if guessed is None else guessed[begin:]
+    matched = (
+        online.match_log(config, increments, scans, odometry_guessed=guessed)
+        if match_scans
+        else None
+    )
     return numpy_episode(
         truth[begin:],
         increments,

@@ -75,6 +75,7 @@ def run_slam(
     ranges: Any,
     *,
     start: Any = None,
+    odometry_guessed: Any = None,
     match_scans: bool = True,
     smooth: bool = True,
     callback: Callable[[SlamState, ChunkResult], Any] | None = None,
@@ -95,6 +96,8 @@ def run_slam(
         ranges: (T, R) raw ranges [m] of the scanner's R beams; NaN, infinite, not above zero or not
             below `range_max` is no return. Or a `Scan` [T].
         start: (3,) [m, m, rad] first pose, map frame; zero by default.
+        odometry_guessed: (T,) bool, which increments of the odometry are guesses of whoever read
+            the log, not what the wheels said (`LaserLog.odometry_guessed`); none by default.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
         callback: Called after each chunk with the state and the result of the chunk.
@@ -110,17 +113,22 @@ def run_slam(
     scans = arguments.as_scans(config.frontend.lidar, ranges, len(increments))
     pose = arguments.as_start(start)
     notes: tuple[str, ...] = ()
+    guessed = arguments.as_guessed(odometry_guessed, len(increments))
     if match_scans and config.scan_matching.use_odometry:
-        increments, notes = _repaired(increments, scans)
+        increments, is_share, notes = _repaired(increments, scans)
+        guessed |= is_share
     elif match_scans:
         increments = np.zeros_like(increments)
     state, parts = online.init(config, pose, match_scans=match_scans), []
-    following = chunks.extract_chunk(config, state.submap, *chunks.chunk_at(0, increments, scans))
+    following = chunks.extract_chunk(
+        config, state.submap, *chunks.chunk_at(0, increments, scans), guessed[: chunks.CHUNK]
+    )
     for first in range(0, len(increments), chunks.CHUNK):
         chunk, after = following, first + chunks.CHUNK
         if after < len(increments):  # in the background while the filter works on this chunk
             some = chunks.chunk_at(after, increments, scans)
-            following = chunks.extract_chunk(config, chunk.submap, *some)
+            some_guessed = guessed[after : after + chunks.CHUNK]
+            following = chunks.extract_chunk(config, chunk.submap, *some, some_guessed)
         state, part = online.advance(config, params, state, chunk)
         parts.append(part)
         if callback is not None:
@@ -156,11 +164,11 @@ def run_slam(
     )
 
 
-def _repaired(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Odometry (T, 3) whose leaps are shared out, and a note if there were any."""
-    odometry, num_leaps = share_out_leaps(odometry, scans)
+def _repaired(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Odometry (T, 3) whose leaps are shared out, its shares (T,), and a note if there are any."""
+    odometry, is_share, num_leaps = share_out_leaps(odometry, scans)
     note = f"{num_leaps} leaps after latched poses shared out over the scans before"
-    return odometry, (note,) if num_leaps else ()
+    return odometry, is_share, (note,) if num_leaps else ()
 
 
 def _contradictions(odometry_weight: np.ndarray) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from jaxslam.core import trace_cache
+from jaxslam.core.batching import pad_to
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Lidar
@@ -138,13 +139,16 @@ def topological_map(config: Config, state: SlamState, poses: Any) -> Topological
     )
 
 
-def match_log(config: Config, odometry: Any, ranges: Any) -> ScanMatch:
+def match_log(
+    config: Config, odometry: Any, ranges: Any, *, odometry_guessed: Any = None
+) -> ScanMatch:
     """Increments [T] by scan matching alone, without a filter; NumPy.
 
     Args:
         config: Of the scan matcher, and the scanner.
         odometry: (T, 3) [m, m, rad] increments since the scan before, the first guess.
         ranges: (T, R) raw ranges [m], or a `Scan` [T].
+        odometry_guessed: (T,) bool, as of `run_slam`.
 
     Raises:
         ValueError: An argument has another shape, or the odometry looks like poses.
@@ -152,9 +156,11 @@ def match_log(config: Config, odometry: Any, ranges: Any) -> ScanMatch:
     increments = arguments.as_log_odometry(odometry)
     lidar, spec = config.frontend.lidar, config.scan_matching
     scans = arguments.as_scans(lidar, ranges, len(increments))
+    guessed = arguments.as_guessed(odometry_guessed, len(increments))
     submap, parts = scan_matching.empty_submap(spec, lidar), []
     for first in range(0, len(increments), chunks.CHUNK):
         some = chunks.padded_chunk(*chunks.chunk_at(first, increments, scans))
-        submap, part = scan_matching.match_scans(spec, lidar, submap, *some)
+        some_guessed = pad_to(guessed[first : first + chunks.CHUNK], to=chunks.CHUNK)
+        submap, part = scan_matching.match_scans(spec, lidar, submap, *some, guessed=some_guessed)
         parts.append(part)
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(increments)], *parts)

@@ -31,7 +31,7 @@ def test_every_layout_gives_the_same_log(tmp_path, name):
     log = read(tmp_path, name)
     assert_drive(log)
     assert [note for note in log.notes if "no transform" not in note] == []
-    assert not log.odometry_stale.any() and log.num_skipped == 0
+    assert not log.odometry_guessed.any() and log.num_skipped == 0
 
 
 def changed(change, kinds=("scan", "odometry")):
@@ -132,7 +132,7 @@ def test_a_span_without_odometry_is_marked(tmp_path, name):
     ]
     log = read(tmp_path, name, said)
     assert any("odometry is missing (1 x, up to 5." in note for note in log.notes)
-    stale = np.flatnonzero(log.odometry_stale)
+    stale = np.flatnonzero(log.odometry_guessed)
     assert stale[0] in (20, 21) and stale[-1] in (44, 45, 46) and len(stale) == np.ptp(stale) + 1
 
 

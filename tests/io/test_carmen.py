@@ -168,7 +168,7 @@ def test_beam_count_that_changes_for_good(tmp_path):
 def test_log_without_odometry(tmp_path, tail):
     lines = [f"FLASER 4 1 2 3 4 {tail.format(t=t)}" for t in range(20)]
     log = carmen.read(save(tmp_path / "a.clf", lines))
-    assert not log.has_odometry and not log.odom_poses.any() and log.odometry_stale.all()
+    assert not log.has_odometry and not log.odom_poses.any() and log.odometry_guessed.all()
     assert len(log.times) == 20 and (np.diff(log.times) > 0).all()
     assert "no odometry: the log has none" in log.notes
     lines = [line for t in range(20) for line in (lines[t], odom(t - 0.5), odom(t + 0.5))]

@@ -22,7 +22,7 @@ def laser_log():
         num_skipped=0,
         odom_stream_times=np.sort(rng.uniform(0, 9, 20)),
         odom_stream_poses=np.cumsum(rng.normal(0.0, 0.1, (20, 3)), axis=0),
-        odometry_stale=np.zeros(T, bool),
+        odometry_guessed=np.zeros(T, bool),
         mount=np.array([0.1, 0.2, 0.3]),
     )
 

@@ -69,7 +69,7 @@ def test_cases_are_read_as_the_good_one_is(read, name):
     right = right[kept]
     found, right = relative(found[0], found), relative(right[0], right)
     np.testing.assert_allclose(found[:, :2], right[:, :2], atol=near)
-    assert log.odometry_stale.sum() <= 1
+    assert log.odometry_guessed.sum() <= 1
     assert -np.pi - 0.1 < log.lidar.angle_min < -np.pi + 0.1
 
 

@@ -73,17 +73,31 @@ def test_scores_are_those_of_brute_force():
     field = jnp.asarray(slow_field(points))
     hit = jnp.arange(41) < 40
     padded = jnp.asarray(np.concatenate([scan, [[0.0, 0.0]]]))
-    found = correlative.window_scores(SPEC, field, padded, hit)
-    np.testing.assert_allclose(found, slow_scores(points, scan), atol=1e-6)
+    found = correlative.window_scores(SPEC, field, padded, hit, jnp.asarray(False))
+    middle = len(found) // 2
+    slow = slow_scores(points, scan)
+    np.testing.assert_allclose(found[middle - 4 : middle + 5], slow, atol=1e-6)
+    assert np.isneginf(found[: middle - 4]).all() and np.isneginf(found[middle + 5 :]).all()
+    whole = correlative.window_scores(SPEC, field, padded, hit, jnp.asarray(True))
+    assert np.isfinite(whole).all() and len(whole) * SPEC.turn_step > 2 * np.pi - 0.1
+    np.testing.assert_allclose(whole[middle - 4 : middle + 5], slow, atol=1e-6)
 
 
-def search(points, guess, expected, scan):
-    """The search, with every point there is."""
-    valid, hit = jnp.ones(len(points), bool), jnp.ones(len(scan), bool)
-    points, scan = jnp.asarray(points), jnp.asarray(scan)
-    return jax.jit(correlative.search, static_argnums=0)(
-        SPEC, points, valid, guess, expected, scan, hit
-    )
+def search(points, guess, expected, scan, every_heading=False):
+    """The search, with every point there is, near poses (E, 3) as likely as a Gaussian says."""
+
+    @jax.jit
+    def found(points, guess, expected, scan):
+        def log_density(pose):
+            off = jax.vmap(relative, (None, 0))(pose, expected)
+            off = off / jnp.array([[0.5, 0.5, 0.75]])
+            return -0.5 * jnp.min(jnp.sum(off**2, axis=1))
+
+        valid, hit = jnp.ones(len(points), bool), jnp.ones(len(scan), bool)
+        every = jnp.asarray(every_heading)
+        return correlative.search(SPEC, points, valid, guess, log_density, scan, hit, every)
+
+    return found(jnp.asarray(points), guess, expected, jnp.asarray(scan))
 
 
 @pytest.mark.parametrize("offset", [[0.0, 0.0, 0.0], [0.4, -0.3, 0.3], [-0.45, 0.2, -0.4]])
@@ -124,10 +138,16 @@ def test_candidates_are_different_places_and_those_expected_come_first():
             assert np.hypot(*apart[:2]) >= SPEC.distinct[0] or apart[2] >= SPEC.distinct[1]
 
 
-def test_surprise_grows_with_the_distance_from_the_nearest_pose_and_ends():
-    expected = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 3.1]])
-    assert correlative.surprise(SPEC, expected, jnp.array([1.0, 0.0, 3.1 - 2 * np.pi])) < 1e-9
-    one_std = correlative.surprise(SPEC, expected, jnp.array([0.0, SPEC.expected_std[0], 0.0]))
-    np.testing.assert_allclose(one_std, SPEC.penalty)
-    far = correlative.surprise(SPEC, expected, jnp.array([100.0, 0.0, 0.0]))
-    np.testing.assert_allclose(far, SPEC.max_penalty)
+def test_where_all_headings_are_searched_a_robot_that_looks_back_is_found():
+    true = jnp.array([0.2, 0.1, 0.5])
+    guess = compose(true, jnp.array([0.2, 0.1, 3.0]))
+    scan = np.asarray(jax.vmap(lambda p: transform(relative(true, jnp.zeros(3)), p))(room()))
+    for every, near in ((True, True), (False, False)):
+        off = np.asarray(relative(true, search(room(), guess, guess[None], scan, every).poses[0]))
+        assert (np.hypot(*off[:2]) < 0.15 and abs(off[2]) < 0.06) == near
+
+
+def test_surprise_grows_with_the_logarithm_of_the_density_and_ends():
+    np.testing.assert_allclose(correlative.surprise(SPEC, jnp.zeros(())), 0.0)
+    np.testing.assert_allclose(correlative.surprise(SPEC, -jnp.ones(())), SPEC.score_scale)
+    np.testing.assert_allclose(correlative.surprise(SPEC, -1e6 * jnp.ones(())), SPEC.max_penalty)

@@ -41,8 +41,9 @@ def test_equal_increments_make_up_the_motion(motion, count):
 def test_a_leap_is_shared_out_and_the_poses_after_it_stay(count):
     true = drive()
     hurt = latched(true, 20, count)
-    shared, num_leaps = share_out_leaps(hurt, scans(40, changes=False))
+    shared, is_share, num_leaps = share_out_leaps(hurt, scans(40, changes=False))
     assert num_leaps == 1
+    np.testing.assert_array_equal(np.flatnonzero(is_share), np.arange(20, 20 + count))
     assert np.abs(shared - true).max() < 0.25 < np.abs(hurt - true).max()
     poses, expected = (dead_reckoning(np.zeros(3), x) for x in (shared, true))
     np.testing.assert_allclose(poses[20 + count :], expected[20 + count :], atol=1e-9)
@@ -56,19 +57,19 @@ def test_a_robot_that_stands_and_drives_on_is_left_alone():
         odometry = drive()
         odometry[20:23] = 0.0
         odometry[23] = [start, 0.0, 0.0]
-        shared, num_leaps = share_out_leaps(odometry, scans(40, changes=False))
-        assert num_leaps == 0
+        shared, is_share, num_leaps = share_out_leaps(odometry, scans(40, changes=False))
+        assert num_leaps == 0 and not is_share.any()
         np.testing.assert_array_equal(shared, odometry)
 
 
 def test_scans_that_change_while_the_wheels_stand_say_that_it_is_a_leap():
     odometry = drive()
     odometry[20], odometry[21] = 0.0, [0.35, 0.0, 0.0]
-    assert share_out_leaps(odometry, scans(40, changes=False))[1] == 0
-    assert share_out_leaps(odometry, scans(40, changes=True))[1] == 1
+    assert share_out_leaps(odometry, scans(40, changes=False))[2] == 0
+    assert share_out_leaps(odometry, scans(40, changes=True))[2] == 1
 
 
 def test_logs_without_motion_or_without_scans_are_left_alone():
     still = np.zeros((9, 3))
     np.testing.assert_array_equal(share_out_leaps(still, scans(9, changes=True))[0], still)
-    assert share_out_leaps(np.zeros((0, 3)), scans(0, changes=True))[1] == 0
+    assert share_out_leaps(np.zeros((0, 3)), scans(0, changes=True))[2] == 0

@@ -2,10 +2,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 from simulated_scans import CORRIDOR, LIDAR, odometry_of, scans_of
 
-from jaxslam.core.se2 import compose, relative
-from jaxslam.matching import motion_prior, wide_search
+from jaxslam.core.se2 import compose, relative, transform
+from jaxslam.frontend import lidar
+from jaxslam.matching import motion_prior, oriented_points, wide_search
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.scan_matching import empty_submap, match_scans
 from jaxslam.matching.wide_search import MatchedPose
@@ -108,27 +110,112 @@ def test_equal_places_are_ambiguous_rather_than_guessed():
     np.testing.assert_allclose(found[1, 1], 1e6, rtol=1e-6)
 
 
-def test_distrust_grows_with_contradictions_and_is_forgotten():
+def history_of(increment, count=40, contradicted=False):
     history = motion_prior.first_history()
+    for k in range(count):
+        step = increment + 0.005 * (k % 2)
+        history = motion_prior.next_history(history, step, jnp.ones(()), jnp.asarray(contradicted))
+    return history
+
+
+def test_wheels_are_trusted_less_the_more_they_are_contradicted_and_it_is_forgotten():
     wheels, moved = jnp.array([0.0, 0.0, 0.0]), jnp.array([0.3, 0.0, 0.0])
-    assert motion_prior.contradicts(SPEC, wheels, moved)
-    assert not motion_prior.contradicts(SPEC, moved, moved)
-    for _ in range(20):
-        history = motion_prior.next_history(history, moved, jnp.ones(()), jnp.asarray(True))
-    distrusted = motion_prior.expected_motion(SPEC, history, wheels, history.distrust)
-    np.testing.assert_allclose(distrusted.increment, moved, atol=0.01)
+    right = motion_prior.wheel_motion(SPEC, motion_prior.first_history(), moved, jnp.array(False))
+    wrong = right._replace(increment=wheels)
+    assert motion_prior.contradicts(wrong, moved) and not motion_prior.contradicts(right, moved)
+    history = history_of(moved, contradicted=True)
+    hanging = motion_prior.wheel_motion(SPEC, history, wheels, jnp.array(False))
+    expected = motion_prior.expected_motion(history, hanging)
+    np.testing.assert_allclose(expected.increment, moved, atol=0.011)
     for _ in range(30):
         history = motion_prior.next_history(history, moved, jnp.ones(()), jnp.asarray(False))
-    assert history.distrust < 0.01
-    trusted = motion_prior.expected_motion(SPEC, history, moved + 0.01, history.distrust)
-    np.testing.assert_allclose(trusted.increment, moved + 0.01, atol=1e-3)
+    good = motion_prior.wheel_motion(SPEC, history, moved + 0.01, jnp.array(False))
+    assert good.outlier_probability < 0.01
+    expected = motion_prior.expected_motion(history, good)
+    np.testing.assert_allclose(expected.increment, moved + 0.01, atol=1e-3)
 
 
-def test_a_leap_is_one_of_wheels_and_far_beyond_what_is_usual():
-    history = motion_prior.first_history()
-    for k in range(40):
-        step = jnp.array([0.2 + 0.01 * (k % 2), 0.0, 0.05])
-        history = motion_prior.next_history(history, step, jnp.ones(()), jnp.asarray(False))
-    assert not motion_prior.is_leap(history, step + 0.02)
-    assert motion_prior.is_leap(history, jnp.zeros(3))
-    assert not motion_prior.is_leap(history._replace(distrust=jnp.ones(())), jnp.zeros(3))
+def test_a_guessed_increment_may_be_wrong_and_off_by_the_usual_change():
+    history = history_of(jnp.array([0.3, 0.0, 0.0]))
+    said, guessed = (
+        motion_prior.wheel_motion(SPEC, history, jnp.array([0.3, 0.0, 0.0]), jnp.array(g))
+        for g in (False, True)
+    )
+    assert said.outlier_probability == 0.0 and guessed.outlier_probability == 0.5
+    change = motion_prior.change_variance(history)
+    np.testing.assert_allclose(guessed.variance, said.variance + change)
+
+
+def test_the_density_of_the_pose_is_that_of_a_mixture_of_two_student_t_distributions():
+    history = history_of(jnp.array([0.3, 0.0, 0.1]))
+    wheels = motion_prior.WheelMotion(
+        jnp.array([0.1, 0.05, -0.2]), jnp.array([0.01, 0.02, 0.03]), jnp.array(0.3)
+    )
+    before, rng = jnp.array([2.0, -1.0, 0.7]), np.random.default_rng(0)
+    found = motion_prior.pose_hypotheses(history, wheels, before)
+    change = np.asarray(motion_prior.change_variance(history))
+    turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
+    parts = [
+        (weight, multivariate_t(np.asarray(compose(before, mean)), turn @ cov @ turn.T, df=3))
+        for weight, mean, cov in (
+            (0.7, wheels.increment, np.diag(wheels.variance)),
+            (0.3, history.increment, np.diag(change)),
+        )
+    ]
+    poses = np.asarray(before) + rng.normal(size=(20, 3)) * 0.2
+    slow = np.log(sum(weight * part.pdf(poses) for weight, part in parts))
+    peak = np.log(max(weight * part.pdf(part.loc) for weight, part in parts))
+    fast = [motion_prior.log_density(found, jnp.asarray(pose)) for pose in poses]
+    np.testing.assert_allclose(fast, slow - peak, rtol=1e-3, atol=1e-3)
+
+
+def test_wheels_need_a_look_where_they_leap_or_were_wrong_of_late_and_rule_out_the_motion_before():
+    step = jnp.array([0.2, 0.0, 0.05])
+    history = history_of(step)
+    wheels = motion_prior.wheel_motion(SPEC, history, step + 0.02, jnp.array(False))
+    assert not motion_prior.need_a_look(SPEC, history, wheels)
+    leap = wheels._replace(increment=jnp.zeros(3))
+    assert motion_prior.need_a_look(SPEC, history, leap)
+    assert not motion_prior.need_a_look(SCANS_ONLY, history, leap)
+    known = leap._replace(outlier_probability=jnp.ones(()))
+    assert not motion_prior.need_a_look(SPEC, history, known)
+    wrong_of_late = history._replace(contradicted=jnp.array(0.4))
+    assert motion_prior.need_a_look(SPEC, wrong_of_late, known)
+
+
+def slow_contradicted(lidar, clouds, poses, points):
+    """The same, point by point and keyframe by keyframe."""
+    total = 0.0
+    for point in points:
+        saw, free = 0, 0
+        for cloud, pose in zip(clouds, poses, strict=True):
+            away = point - pose[:2]
+            bearing = np.arctan2(*away[::-1]) - pose[2]
+            bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+            beam = round((bearing - lidar.angle_min) / lidar.angle_increment)
+            if 1 <= beam < lidar.num_beams - 1:
+                around = np.hypot(*(cloud[beam - 1 : beam + 2] - pose[:2]).T)
+                saw += 1
+                free += np.hypot(*away) < around.min() - wide_search.FREE_MARGIN
+        total += free / max(saw, 1)
+    return total / len(points)
+
+
+def test_contradicted_are_points_in_space_that_keyframes_saw_to_be_free(drive):
+    poses, scans = (jax.tree.map(lambda x: x[:3], part) for part in drive)
+    surfaces = jax.vmap(lambda s: oriented_points.oriented_points(LIDAR, s))(scans)
+    surfaces = jax.vmap(oriented_points.transform_points)(poses, surfaces)
+    surfaces = surfaces._replace(valid=jnp.ones_like(surfaces.valid))
+    ends = jax.vmap(lambda s: lidar.beam_ends(LIDAR, s))(scans)
+    points = np.array(transform(poses[1], ends[1, ::5]))
+    points[::3] = np.asarray(poses[1])[:2] + 0.5 * (points[::3] - np.asarray(poses[1])[:2])
+    hit = jnp.ones(len(points), bool)
+    found = wide_search.contradicted_fraction(LIDAR, surfaces, poses, jnp.asarray(points), hit)
+    clouds = np.asarray(surfaces.points)
+    expected = slow_contradicted(LIDAR, clouds, np.asarray(poses), points)
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert 0.15 < expected < 0.5
+    ahead = wide_search.contradicted_fraction(
+        LIDAR, surfaces, poses, jnp.asarray(points), jnp.arange(len(points)) % 3 != 0
+    )
+    assert ahead < 0.02

@@ -35,7 +35,7 @@ CONFIG = Config.for_lidar(
         max_landmarks=60,
         max_new=4,
     ),
-    scan_matching=ScanMatchSpec(window_scans=4, heading_guesses=(0.0,)),
+    scan_matching=ScanMatchSpec(window_scans=4),
 )
 PARAMS = NoiseParams.for_laser_log(match_scans=True)
 START = jnp.array([2.5, 2.0, 0.3])

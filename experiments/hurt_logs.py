@@ -1,6 +1,6 @@
 """Logs with one fault that recorded logs have: in stamps, odometry, mount, scans or beams.
 
-A fault is a pure function of a random generator and a `Recording`. Scans keep their numbers, so
+A fault is a pure function of a random generator and a `DriveRecord`. Scans keep their numbers, so
 that they can be compared with a reference whatever their stamps are.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from experiments import damaged_drives
-from experiments.recordings import Recording
+from experiments.drive_records import DriveRecord
 from jaxslam.core.se2_np import compose, dead_reckoning, increments, relative, wrap_angle
 
 UNHURT = "none"
@@ -24,7 +24,7 @@ MOUNT = (0.25, 0.0, math.radians(3.0))  # [m, m, rad] of the scanner on the robo
 MISSING_BEAMS, BLOCK_OF_BEAMS = 0.3, (3, 12)
 DROPPED_SCANS, BLOCK_OF_SCANS = 0.1, (1, 5)
 
-Fault = Callable[[np.random.Generator, Recording], Recording]
+Fault = Callable[[np.random.Generator, DriveRecord], DriveRecord]
 StampFault = Callable[[np.random.Generator, np.ndarray], np.ndarray]
 """From stamps (L,) [s] of all lines in file order to those that are written."""
 
@@ -62,7 +62,7 @@ def set_back(rng: np.random.Generator, stamps: np.ndarray) -> np.ndarray:
 def on_stamps(fault: StampFault) -> Fault:
     """The fault of a recording, scans and odometry, whose clock has a fault."""
 
-    def hurt(rng: np.random.Generator, recording: Recording) -> Recording:
+    def hurt(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
         num_messages = len(recording.stream_stamps)
         stamps = np.concatenate([recording.stream_stamps, recording.stamps])
         stamps[recording.order] = fault(rng, stamps[recording.order])
@@ -71,7 +71,7 @@ def on_stamps(fault: StampFault) -> Fault:
     return hurt
 
 
-def _with_poses(recording: Recording, poses: np.ndarray) -> Recording:
+def _with_poses(recording: DriveRecord, poses: np.ndarray) -> DriveRecord:
     """A recording with other odometry (T, 3), which stands with the scans alone."""
     none = np.zeros((0, 3))
     order = np.arange(len(poses))
@@ -80,11 +80,11 @@ def _with_poses(recording: Recording, poses: np.ndarray) -> Recording:
     )
 
 
-def _with_increments(recording: Recording, steps: np.ndarray) -> Recording:
+def _with_increments(recording: DriveRecord, steps: np.ndarray) -> DriveRecord:
     return _with_poses(recording, dead_reckoning(recording.odom_poses[0], steps))
 
 
-def _only(recording: Recording, kept: np.ndarray) -> Recording:
+def _only(recording: DriveRecord, kept: np.ndarray) -> DriveRecord:
     """The recording with some of its scans, by index."""
     some = recording._replace(
         number=recording.number[kept],
@@ -94,7 +94,7 @@ def _only(recording: Recording, kept: np.ndarray) -> Recording:
     return _with_poses(some, recording.odom_poses[kept])
 
 
-def unsigned(rng: np.random.Generator, recording: Recording) -> Recording:
+def unsigned(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The wheels give the speed without its sign: backwards is forwards."""
     steps = increments(recording.odom_poses)
     steps[:, 0] = np.abs(steps[:, 0])
@@ -118,7 +118,7 @@ def draw_spans(
     return np.stack([start, start + length], axis=1)
 
 
-def latched(rng: np.random.Generator, recording: Recording) -> Recording:
+def latched(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The odometry repeats an old pose for some scans, then leaps to the one that is right."""
     poses = recording.odom_poses.copy()
     count = max(1, round(LATCHED * len(poses)))
@@ -127,7 +127,7 @@ def latched(rng: np.random.Generator, recording: Recording) -> Recording:
     return _with_poses(recording, poses)
 
 
-def lost(rng: np.random.Generator, recording: Recording) -> Recording:
+def lost(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The wheels report nothing of some turns, each within three scans."""
     steps = increments(recording.odom_poses)
     turned = np.abs(wrap_angle(np.convolve(steps[:, 2], np.ones(3), "valid")))
@@ -140,14 +140,14 @@ def lost(rng: np.random.Generator, recording: Recording) -> Recording:
     return _with_increments(recording, steps)
 
 
-def still(rng: np.random.Generator, recording: Recording) -> Recording:
+def still(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The odometry stands still, but for a millimetre at the start."""
     steps = np.zeros_like(recording.odom_poses)
     steps[1:2, 0] = 1e-3
     return _with_increments(recording, steps)
 
 
-def carried(rng: np.random.Generator, recording: Recording) -> Recording:
+def carried(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The robot is carried: the scans of that time are missing, and the wheels stand still."""
     num_scans = len(recording.number)
     gone = min(damaged_drives.CARRIED_SCANS, num_scans // 5)
@@ -158,19 +158,19 @@ def carried(rng: np.random.Generator, recording: Recording) -> Recording:
     return _with_increments(_only(recording, kept), steps)
 
 
-def scale(rng: np.random.Generator, recording: Recording) -> Recording:
+def scale(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The wheels are out of calibration: distances come out too long, turns too small."""
     factors = np.array([DISTANCE_SCALE, DISTANCE_SCALE, TURN_SCALE])
     return _with_increments(recording, increments(recording.odom_poses) * factors)
 
 
-def mount(rng: np.random.Generator, recording: Recording) -> Recording:
+def mount(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The poses are those of the robot, on which the scanner sits ahead and turned."""
     robot_in_scanner = relative(np.array(MOUNT), np.zeros(3))
     return _with_poses(recording, compose(recording.odom_poses, robot_in_scanner))
 
 
-def missing(rng: np.random.Generator, recording: Recording) -> Recording:
+def missing(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """Of each scan, 30 % of the beams or a few more return nothing, in blocks."""
     ranges = recording.ranges.copy()
     num_beams = ranges.shape[1]
@@ -183,7 +183,7 @@ def missing(rng: np.random.Generator, recording: Recording) -> Recording:
     return _with_poses(recording._replace(ranges=ranges), recording.odom_poses)
 
 
-def dropped(rng: np.random.Generator, recording: Recording) -> Recording:
+def dropped(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """Of the scans, a tenth or a few more are missing, in blocks; the wheels go on."""
     num_scans = len(recording.number)
     gone = np.zeros(num_scans, bool)
@@ -193,14 +193,14 @@ def dropped(rng: np.random.Generator, recording: Recording) -> Recording:
     return _only(recording, np.flatnonzero(~gone))
 
 
-def people(rng: np.random.Generator, recording: Recording) -> Recording:
+def people(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """Three people walk about near the robot, in all scans."""
     ranges = damaged_drives.with_people(rng, recording.lidar, recording.ranges)
     ranges = np.round(ranges.astype(np.float64), 3)
     return _with_poses(recording._replace(ranges=ranges), recording.odom_poses)
 
 
-def unhurt(rng: np.random.Generator, recording: Recording) -> Recording:
+def unhurt(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The recording as it is."""
     return recording
 
@@ -221,6 +221,6 @@ RANDOM |= {"missing", "dropped", "people"}
 """The faults that depend on the seed."""
 
 
-def hurt(how: str, seed: int, recording: Recording) -> Recording:
+def hurt(how: str, seed: int, recording: DriveRecord) -> DriveRecord:
     """A recording with a fault of `FAULTS`."""
     return FAULTS[how](np.random.default_rng([seed, *how.encode()]), recording)

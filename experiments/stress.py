@@ -19,9 +19,9 @@ from tqdm import tqdm
 
 from experiments import common, damaged_drives, hurt_logs, log_folder
 from experiments.common import Numbers
+from experiments.drive_records import DriveRecord, numbers_of, write
 from experiments.hurt_logs import FAULTS
 from experiments.log_folder import Log
-from experiments.recordings import Recording, numbers_of, write
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.time_series import match_times
@@ -50,7 +50,7 @@ class Source(NamedTuple):
     """
 
     name: str
-    recording: Recording
+    recording: DriveRecord
     truth: np.ndarray
     log: Log | None = None
 
@@ -62,14 +62,14 @@ def recorded(name: str, log: Log) -> Source:
         i, j = match_times(log.laser_log.times, log.reference[0]).T
         truth[i] = log.reference[1][j]
     has_relations = log.relations is not None
-    return Source(name, Recording.of_log(log.laser_log), truth, log if has_relations else None)
+    return Source(name, DriveRecord.of_log(log.laser_log), truth, log if has_relations else None)
 
 
 def simulated(seed: int, number: int) -> Source:
     """The source of a simulated drive with the odometry of wheels that drift."""
     drive = damaged_drives.simulate(1_000_000 * (seed + 1) + number, reversing=True)
     rng = np.random.default_rng([seed, number])
-    return Source(f"{SIMULATED}-{number}", Recording.of_drive(rng, drive), drive.poses)
+    return Source(f"{SIMULATED}-{number}", DriveRecord.of_drive(rng, drive), drive.poses)
 
 
 def cases(seed: int, num_seeds: int) -> Iterator[tuple[str, int | None]]:

@@ -16,7 +16,7 @@ SPEED, MIN_STEP = 0.5, 0.1  # [m/s], [s] of simulated robots
 START = 1.2e9  # [s] of their clock
 
 
-class Recording(NamedTuple):
+class DriveRecord(NamedTuple):
     """What a robot wrote down: T scans and N odometry messages.
 
     Attributes:
@@ -40,7 +40,7 @@ class Recording(NamedTuple):
     order: np.ndarray
 
     @classmethod
-    def of_log(cls, log: LaserLog) -> "Recording":
+    def of_log(cls, log: LaserLog) -> "DriveRecord":
         """The recording of a log that is as it should be."""
         scans = _of_scans(
             np.arange(len(log.times)), log.times, log.odom_poses, log.ranges, log.lidar
@@ -55,7 +55,7 @@ class Recording(NamedTuple):
         )
 
     @classmethod
-    def of_drive(cls, rng: np.random.Generator, drive: damaged_drives.Drive) -> "Recording":
+    def of_drive(cls, rng: np.random.Generator, drive: damaged_drives.Drive) -> "DriveRecord":
         """The recording of a simulated drive, with the odometry of wheels that drift."""
         wheels = damaged_drives.wheels(rng, drive.poses).poses
         moved = np.hypot(*increments(drive.poses)[:, :2].T)
@@ -68,13 +68,15 @@ class Recording(NamedTuple):
 
 def _of_scans(
     number: np.ndarray, stamps: np.ndarray, poses: np.ndarray, ranges: np.ndarray, lidar: Lidar
-) -> Recording:
+) -> DriveRecord:
     ranges = mark_no_return(np.round(ranges.astype(np.float64), 3), lidar.range_max)
     none = np.zeros((0, 3))
-    return Recording(number, stamps, poses, ranges, lidar, none[:, 0], none, np.arange(len(number)))
+    return DriveRecord(
+        number, stamps, poses, ranges, lidar, none[:, 0], none, np.arange(len(number))
+    )
 
 
-def write(path: Path, recording: Recording) -> None:
+def write(path: Path, recording: DriveRecord) -> None:
     """Write a CARMEN log, of FLASER lines where these can describe the scanner."""
     usual = half_circle_lidar(recording.lidar.num_beams, DEFAULT_RANGE_MAX)
     own = recording.lidar
@@ -110,7 +112,7 @@ def _tail(stamp: float) -> str:
     return f"{stamp:.6f} robot {stamp:.6f}"
 
 
-def numbers_of(recording: Recording, log: LaserLog) -> np.ndarray:
+def numbers_of(recording: DriveRecord, log: LaserLog) -> np.ndarray:
     """Numbers (K,) of the K scans of a log that a reader made of the recording.
 
     A reader may leave out scans, but not change their order: they are known by their ranges.

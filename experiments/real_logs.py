@@ -281,7 +281,9 @@ def main(argv: list[str] | None = None) -> int:
     if not logs or not (args.ablation or args.full_rate):
         raise InputError("no log", advice="give --data FOLDER, or pip install '.[data]'")
     benchmark = full_rate.compute(logs, cache) if args.full_rate else []
-    numbers = compute(select(logs) if args.ablation else [], bool(args.tune), cache)
+    numbers: common.Numbers = {"rows": [], "ms_per_scan": {}, "ways": {}}
+    if args.ablation:
+        numbers = compute(select(logs), bool(args.tune), cache)
     numbers |= {"full_rate": benchmark}
     common.save(args.out, NAME, {"seed": args.seed} | numbers, draw)
     cache.clear()

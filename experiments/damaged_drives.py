@@ -27,6 +27,7 @@ LIDARS = (
     Lidar(num_beams=271, angle_min=-0.75 * np.pi, angle_increment=np.pi / 180, range_max=30.0),
 )
 STEPS = (0.25, 0.7)  # [m] between scans: all of them, or keyframes
+REVERSALS = 3  # places where a robot that reverses backs up
 CARRIED_SCANS = 39  # left out while the robot is carried
 
 
@@ -44,8 +45,13 @@ class Drive(NamedTuple):
     poses: np.ndarray
 
 
-def simulate(seed: int) -> Drive:
-    """A drive in the office, or in a random floor plan."""
+def simulate(seed: int, *, reversing: bool = False) -> Drive:
+    """A drive in the office, or in a random floor plan.
+
+    Args:
+        seed: Of all that is random.
+        reversing: Whether the robot drives backwards on a fifth of its path.
+    """
     rng = np.random.default_rng([seed, 1])
     if rng.random() < 0.3:
         walls = worlds.office()
@@ -54,6 +60,8 @@ def simulate(seed: int) -> Drive:
         walls = np.asarray(floor_plans.floor_plan(jax.random.key(seed), size=tuple(size)).walls)
     walls = ground_truth.without_padding(walls)
     poses = _drive_along(_route(rng, walls), rng.choice(STEPS, p=[0.7, 0.3]))
+    if reversing:
+        poses = with_reversing(rng, poses)
     lidar = LIDARS[rng.integers(len(LIDARS))]
     glass = rng.random(len(walls)) < rng.choice([0.0, 0.1], p=[0.7, 0.3])
     halves = [
@@ -62,7 +70,7 @@ def simulate(seed: int) -> Drive:
     ]
     ranges = np.concatenate(halves)
     if rng.random() < 0.5:
-        ranges = _with_people(rng, lidar, ranges)
+        ranges = with_people(rng, lidar, ranges)
     ranges = ranges + rng.normal(0.0, 0.01, ranges.shape)
     hit = (ranges > 0.05) & (ranges < lidar.range_max)
     return Drive(lidar, Scan(np.where(hit, ranges, lidar.range_max), hit), poses)
@@ -122,6 +130,21 @@ def _drive_along(path: np.ndarray, step: float) -> np.ndarray:
     return np.array(poses)
 
 
+def with_reversing(rng: np.random.Generator, poses: np.ndarray) -> np.ndarray:
+    """Poses (T, 3) with `REVERSALS` places from where the robot backs up and drives on again.
+
+    Of the new path, a fifth is driven backwards: with n steps there were, and n / 3 backwards and
+    n / 3 forwards again, n / 3 of 5 n / 3.
+    """
+    back = max(1, round((len(poses) - 1) / 3 / REVERSALS))
+    turning = np.sort(rng.choice(np.arange(back, len(poses)), REVERSALS, replace=False))
+    parts, start = [], 0
+    for k in turning.tolist():
+        parts += [np.arange(start, k + 1), np.arange(k - 1, k - back, -1)]
+        start = k - back
+    return poses[np.concatenate([*parts, np.arange(start, len(poses))])]
+
+
 def _ranges(
     rng: np.random.Generator, lidar: Lidar, poses: np.ndarray, walls: np.ndarray, glass: np.ndarray
 ) -> np.ndarray:
@@ -158,8 +181,8 @@ def _boxes(rng: np.random.Generator, poses: np.ndarray) -> list[np.ndarray]:
     return boxes
 
 
-def _with_people(rng: np.random.Generator, lidar: Lidar, ranges: np.ndarray) -> np.ndarray:
-    """Ranges with three people of radius 0.25 m, who walk about within 4 m of the robot."""
+def with_people(rng: np.random.Generator, lidar: Lidar, ranges: np.ndarray) -> np.ndarray:
+    """Ranges (T, R) [m] with three people of radius 0.25 m, within 4 m of the robot."""
     angles = lidar.angle_min + lidar.angle_increment * np.arange(lidar.num_beams)
     people, ranges = rng.uniform(-3.0, 3.0, (3, 2)), ranges.copy()
     for scan in ranges:

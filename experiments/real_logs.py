@@ -1,7 +1,10 @@
 """Recorded logs: ablation of scan matching, of landmark types and of tuned noise.
 
 Every log in the folder `--data`, and MIT's Killian Court where `.[data]` is installed, with one set
-of defaults. `NAME.reference.tum` and `NAME.relations` beside `NAME.clf` are the references.
+of defaults. `NAME.reference.tum` and `NAME.relations` beside `NAME.clf` are the references; of logs
+of one name, the ablation takes that with fewest scans. Logs with relations at the times of scans
+are run as they are, too, and stand beside published figures (`full_rate`). `--ablation 0` and
+`--full_rate 0` leave out either part.
 Odometry is that of the wheels, or that of the wheels fused with scan matching. Tuned noise is tuned
 on the other logs that have a reference, never on the one it is evaluated on. Errors are those of
 the smoothed trajectory, which is the result of a run, and of the filter's online estimates; NEES is
@@ -21,21 +24,19 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from experiments import common, timing
+from experiments import common, full_rate, log_folder, timing
+from experiments.log_folder import Log
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.features import restrict_features
-from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.se2_np import increments, relative
 from jaxslam.core.time_series import match_times
 from jaxslam.core.types import CORNER, JUNCTION, WALL
 from jaxslam.evaluation import log_errors
-from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import confirmed, init
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
-from jaxslam.io import readers, relations, tum
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes, offline
 from jaxslam.pipeline.config import Config
@@ -43,7 +44,6 @@ from jaxslam.pipeline.offline import SlamResult
 from jaxslam.tuning import fitting
 
 NAME = "real_logs"
-SUFFIXES = (".clf", ".log", ".gz", ".g2o", ".zip", ".bag", ".npz")
 LANDMARKS = {
     "none": (),
     "nodes": (JUNCTION,),
@@ -57,22 +57,6 @@ STYLES = {  # of trajectories: colour, dashes, width
     "estimate": (common.SKY, "-", 2.5),
     "wheels": (common.RED, ":", 0.8),
 }
-
-
-class Log(NamedTuple):
-    """A log, and the references for its trajectory.
-
-    Attributes:
-        name: Of its file.
-        laser_log: Scans and odometry.
-        reference: Reference trajectory, if there is one.
-        relations: Verified relative poses, if there are any.
-    """
-
-    name: str
-    laser_log: LaserLog
-    reference: Trajectory | None
-    relations: Relations | None
 
 
 class Extracted(NamedTuple):
@@ -89,35 +73,12 @@ class Extracted(NamedTuple):
     ms: dict[str, float]
 
 
-def find_logs(folder: Path | None) -> list[Log]:
-    """The logs of a folder, and those of installed packages."""
-    files = sorted(folder.rglob("*")) if folder else []
-    paths = {
-        path.name.split(".")[0]: path
-        for path in files
-        if path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
-    }
-    for name in readers.NAMED_LOGS:
-        try:
-            paths[name] = readers.find_log(name)
-        except InputError as error:
-            print(f"left out: {error}")
-
-    def beside(name: str, ending: str) -> Path | None:
-        own = [file for file in files if file.name.endswith(f"{name}{ending}")]
-        return own[0] if own else None
-
-    logs = []
-    for name, path in paths.items():
-        reference, pairs = beside(name, ".reference.tum"), beside(name, ".relations")
-        log = Log(
-            name,
-            readers.read_log(path),
-            None if reference is None else tum.read(reference),
-            None if pairs is None else relations.read(pairs),
-        )
-        logs.append(log)
-    return logs
+def select(logs: list[Log]) -> list[Log]:
+    """Of each name, the log with fewest scans: that of keyframes, not the one at full rate."""
+    fewest: dict[str, Log] = {}
+    for log in sorted(logs, key=lambda log: len(log.laser_log.times)):
+        fewest.setdefault(log.name, log)
+    return [log for log in logs if fewest[log.name] is log]
 
 
 def extract(log: Log) -> Extracted:
@@ -214,15 +175,8 @@ def row(
     return numbers, poses[:, :2]
 
 
-def compute(folder: Path | None, with_tuning: bool, cache: common.ResultCache) -> common.Numbers:
-    """Rows of all logs, and the trajectories that are drawn.
-
-    Raises:
-        InputError: There is no log, or one cannot be read.
-    """
-    logs = find_logs(folder)
-    if not logs:
-        raise InputError("no log", advice="give --data FOLDER, or pip install '.[data]'")
+def compute(logs: list[Log], with_tuning: bool, cache: common.ResultCache) -> common.Numbers:
+    """Rows of the ablation on all logs, and the trajectories that are drawn."""
     extracted = [extract(log) for log in tqdm(logs, unit="log", desc="extracting features")]
     rows, trajectories = [], {}
     for k, (log, own) in enumerate(zip(logs, extracted, strict=True)):
@@ -265,8 +219,13 @@ def line(row: common.Numbers) -> str:
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """The trajectories of each log, and the errors of all its rows."""
-    logs = numbers["ways"]
+    """The trajectories of each log, and the errors of all its rows; and the benchmark beside it."""
+    logs, benchmark = numbers["ways"], numbers["full_rate"]
+    if benchmark:
+        beside = path.with_stem(f"{path.stem}_full_rate")
+        full_rate.draw(benchmark, beside if logs else path)
+    if not logs:
+        return
     figure, axes = common.canvas(13, 4.6 * len(logs), len(logs), 2)
     for (left, right), (name, own) in zip(axes, logs.items(), strict=True):
         for what, (colour, dashes, width) in STYLES.items():
@@ -313,13 +272,19 @@ def _draw_rows(axis: Any, rows: list[common.Numbers]) -> None:
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    args = common.parse(__doc__, argv, data="", tune=1)
+    args = common.parse(__doc__, argv, data="", tune=1, ablation=1, full_rate=1)
     enable_caches()
     cache = common.ResultCache(args.out / f"{NAME}_parts", {"data": args.data})
-    folder = Path(args.data) if args.data else None
-    if folder is not None and not folder.is_dir():
-        raise InputError("is no folder", path=folder, advice="name the folder of the logs")
-    numbers = compute(folder, bool(args.tune), cache)
+    logs = log_folder.find_logs(log_folder.checked_folder(args.data))
+    if not args.ablation:
+        logs = full_rate.select(logs)
+    if not logs or not (args.ablation or args.full_rate):
+        raise InputError("no log", advice="give --data FOLDER, or pip install '.[data]'")
+    benchmark = full_rate.compute(logs, cache) if args.full_rate else []
+    numbers: common.Numbers = {"rows": [], "ms_per_scan": {}, "ways": {}}
+    if args.ablation:
+        numbers = compute(select(logs), bool(args.tune), cache)
+    numbers |= {"full_rate": benchmark}
     common.save(args.out, NAME, {"seed": args.seed} | numbers, draw)
     cache.clear()
     return 0

@@ -26,20 +26,17 @@ from jaxslam.cli.options import (
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import compose, relative
-from jaxslam.core.se2_np import increments as increments_of
 from jaxslam.evaluation import log_errors, map_consistency
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.frontend import lidar
 from jaxslam.io import relations as relations_file
 from jaxslam.io import tum
 from jaxslam.io.output import folder
-from jaxslam.pipeline import arguments, offline
-from jaxslam.pipeline.config import Config
+from jaxslam.pipeline import log_input
+from jaxslam.pipeline.log_input import LogInput, OdometrySource
 from jaxslam.pipeline.offline import SlamResult
 from jaxslam.pipeline.online import ChunkResult, SlamState
 from jaxslam.viz.rerun_view import RerunView
@@ -51,7 +48,7 @@ def run(
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")],
     reference: OptionalFile = None,
     relations: OptionalFile = None,
-    odometry: Literal["scan", "scans-only", "wheels"] = "scan",
+    odometry: OdometrySource = "scan",
     smooth: bool = True,
     noise: OptionalFile = None,
     scan_topic: OptionalTopic = None,
@@ -101,56 +98,37 @@ def run(
     require_beams(log, laser_log)
     if odometry == "wheels":
         require_odometry(log, laser_log)
-    known, notes = None, list(laser_log.notes)
-    if odometry == "scan" and not laser_log.has_odometry:
-        odometry = "scans-only"
-        notes.append("scans alone are matched, as by --odometry scans-only")
+    known, reference_notes = None, []
     if reference is not None:
         known, more = tum.read_reference(reference)
-        notes += [f"{reference}: {note}" for note in more]
+        reference_notes = [f"{reference}: {note}" for note in more]
     verified = None if relations is None else relations_file.read(relations)
     match_scans = odometry != "wheels"
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     if scan is not None:
         check_range("--scan", scan, 0, len(laser_log.times) - 1)
-    odom_poses = relative(laser_log.odom_poses[0], laser_log.odom_poses)
     with name_errors(str(log)):
-        config = Config.for_laser_log(laser_log.lidar)
-        if odometry == "scans-only":
-            matching = config.scan_matching._replace(use_odometry=False)
-            config = config._replace(scan_matching=matching)
-        config.check()
-        increments = arguments.as_log_odometry(increments_of(odom_poses))
-        scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
-        arguments.as_scans(config.frontend.lidar, laser_log.ranges, len(increments))
+        given = log_input.from_laser_log(laser_log, odometry)
+    config, odom_poses, scans = given.config, given.odom_poses, given.scans
     with name_errors(str(reference)):
         dead_reckoning = log_errors.errors_against(laser_log, odom_poses, known, None)
     with name_errors(str(relations)):
         dead_reckoning |= log_errors.errors_against(laser_log, odom_poses, None, verified)
     with folder(out) as out_dir:
         enable_caches()
-        size = f"{len(increments)} scans of {config.frontend.lidar.num_beams} beams"
+        size = f"{len(odom_poses)} scans of {config.frontend.lidar.num_beams} beams"
         print(f"{log}: {size}{laser_log.source}", flush=True)
         with stopwatch() as seconds:
             viewer = None
             if rerun is not None:
                 file = out_dir / "run.rrd" if rerun == "file" else None
                 viewer = RerunView(config, laser_log.times, scans, file)
-            result = _run_slam(
-                config,
-                params,
-                increments,
-                scans,
-                guessed=laser_log.odometry_guessed,
-                match_scans=match_scans,
-                smooth=smooth,
-                viewer=viewer,
-            )
+            result = _run_slam(given, params, smooth=smooth, viewer=viewer)
         numbers = {
             "scans": len(result.poses),
             "skipped_lines": laser_log.num_skipped,
-            "mended": [*notes, *result.notes],
-            "odometry": odometry,
+            "mended": [*given.notes, *reference_notes, *result.notes],
+            "odometry": given.odometry_source,
             "path_length_m": log_errors.path_length(result.poses if match_scans else odom_poses),
             "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
             "matches": float(np.mean(np.sum(np.asarray(result.info.used), axis=1))),
@@ -225,38 +203,22 @@ def _online_errors(laser_log: LaserLog, result: SlamResult, reference: Trajector
 
 
 def _run_slam(
-    config: Config,
-    params: NoiseParams,
-    increments: np.ndarray,
-    scans: Scan,
-    *,
-    guessed: np.ndarray | None,
-    match_scans: bool,
-    smooth: bool,
-    viewer: RerunView | None,
+    given: LogInput, params: NoiseParams, *, smooth: bool, viewer: RerunView | None
 ) -> SlamResult:
     """Run SLAM on a log, with a progress bar."""
-    with tqdm(total=len(increments), unit="scan", desc="compiling", mininterval=0.2) as bar:
+    num_scans = len(given.increments)
+    with tqdm(total=num_scans, unit="scan", desc="compiling", mininterval=0.2) as bar:
 
         def show_progress(state: SlamState, chunk: ChunkResult) -> None:
-            done = bar.n + len(chunk.info.finite) == len(increments)
+            done = bar.n + len(chunk.info.finite) == num_scans
             bar.set_description("smoothing" if done and smooth else "mapping", refresh=False)
-            num_landmarks = int(np.sum(confirmed(config.filter, state.belief)))
+            num_landmarks = int(np.sum(confirmed(given.config.filter, state.belief)))
             bar.set_postfix_str(f"{num_landmarks} landmarks", refresh=False)
             bar.update(len(chunk.info.finite))
             if viewer is not None:
                 viewer.watch(state, chunk)
 
-        result = offline.run_slam(
-            config,
-            params,
-            increments,
-            scans,
-            odometry_guessed=guessed,
-            match_scans=match_scans,
-            smooth=smooth,
-            callback=show_progress,
-        )
+        result = log_input.run(given, params, smooth=smooth, callback=show_progress)
     if viewer is not None:
         viewer.end(result)
     return result

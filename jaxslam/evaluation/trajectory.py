@@ -149,8 +149,9 @@ def relation_errors(
         relations: Times t1 (K,) and t2 (K,) [s], and the pose (K, 3) at t2 in the frame at t1.
 
     Returns:
-        `translation_mean_m`, `translation_std_m`, `rotation_mean_deg`, `rotation_std_deg` of the
-        absolute errors, and `used`: number of relations within the time span of the estimate.
+        `translation_mean_m`, `translation_std_m`, `translation_max_m`, `rotation_mean_deg`,
+        `rotation_std_deg` of the absolute errors, and `used`: number of relations within the time
+        span of the estimate.
 
     Raises:
         ValueError: No relation is within that time span, or an argument does not fit.
@@ -174,6 +175,7 @@ def relation_errors(
     return {
         "translation_mean_m": float(translation.mean()),
         "translation_std_m": float(translation.std()),
+        "translation_max_m": float(translation.max()),
         "rotation_mean_deg": float(rotation.mean()),
         "rotation_std_deg": float(rotation.std()),
         "used": int(used.sum()),

@@ -33,11 +33,11 @@ from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
 from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, fine_icp, icp
 from jaxslam.matching.motion_prior import (
-    need_a_look,
     change_variance,
     contradicts,
     expected_motion,
     first_history,
+    need_a_look,
     next_history,
     pose_hypotheses,
     wheel_motion,

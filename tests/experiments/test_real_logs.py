@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import real_logs
+from experiments import log_folder, real_logs
 from jaxslam.core.episode import Episode
 from jaxslam.core.types import CORNER, JUNCTION, WALL
 from jaxslam.frontend.features import features_from_range_bearing
@@ -33,7 +33,7 @@ def folder(tmp_path):
 
 
 def test_logs_are_found_with_their_references(folder):
-    found = {one.name: one for one in real_logs.find_logs(folder)}
+    found = {one.name: one for one in log_folder.find_logs(folder)}
     found.pop("killian", None)  # where its package is installed
     assert set(found) == {"hall", "attic"}
     assert len(found["hall"].reference[0]) == 5 and len(found["hall"].relations[0]) == 1
@@ -63,7 +63,7 @@ def test_a_picture_is_drawn_of_logs_with_and_without_reference(tmp_path):
                 row |= {"noise": "default", "ms_per_scan": 5.0, known: 1.0 + k}
                 rows.append(row | {f"filter_{known}": 2.0 + k})
     trajectories["hall"]["reference"] = trajectories["hall"]["estimate"]
-    real_logs.draw({"rows": rows, "ways": trajectories}, tmp_path / "a.png")
+    real_logs.draw({"rows": rows, "ways": trajectories, "full_rate": []}, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
     assert "1.000 m ATE (filter 2.000)" in real_logs.line(rows[0])
     assert "relations" in real_logs.line(rows[-1])

@@ -96,12 +96,16 @@ class MotionHistory(NamedTuple):
         usual_change: (2,) [m], [rad] running mean of its change from scan to scan.
         contradicted: () 0 to 1, how often of late the wheels contradicted the scans.
         usual_inliers: () running mean of the inlier fraction.
+        wheel_scale: () true distance per distance that the wheels report, as far as it is learned.
+        scale_information: () its inverse variance.
     """
 
     increment: Array
     usual_change: Array
     contradicted: Array
     usual_inliers: Array
+    wheel_scale: Array
+    scale_information: Array
 
 
 class Submap(NamedTuple):

@@ -11,6 +11,11 @@ of two Student t distributions, as either is now and then off by several standar
 is how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, and
 `GUESSED_OUTLIER` where the log itself says that an increment is a guess. The quick match needs one
 Gaussian near the right place: both are combined by their information, weighted by 1 - o and o.
+
+Wheels may also be wrong in the same way all the time: a tyre that is worn or soft makes every
+distance some percent too long. What the scans say of it is learned on the way, by a Kalman filter
+of one number, the scale, from scans that show the motion ahead; where a corridor does not, they
+are used with the scale that was learned before.
 """
 
 from typing import NamedTuple
@@ -40,6 +45,12 @@ of the last five."""
 
 MAX_STD = 3.0
 """Standard deviations beyond which an increment contradicts what was expected."""
+
+SCALE_STD = 0.02
+"""Standard deviation of the scale of the wheels' distances before any scan."""
+
+SURFACE_TILT_STD = 0.1
+"""[rad] std of the directions of normals, which makes a bare wall seem to show motion along it."""
 
 LEAST_CHANGE = (0.02, 0.02)
 """[m], [rad] by which a motion may always change: errors of two matches."""
@@ -95,7 +106,14 @@ class PoseHypotheses(NamedTuple):
 
 def first_history() -> MotionHistory:
     """Before the first scan: a robot at rest, and wheels that are trusted."""
-    return MotionHistory(jnp.zeros(3), jnp.array(FIRST_CHANGE), jnp.zeros(()), jnp.ones(()))
+    return MotionHistory(
+        increment=jnp.zeros(3),
+        usual_change=jnp.array(FIRST_CHANGE),
+        contradicted=jnp.zeros(()),
+        usual_inliers=jnp.ones(()),
+        wheel_scale=jnp.ones(()),
+        scale_information=jnp.full((), SCALE_STD**-2),
+    )
 
 
 def wheel_motion(
@@ -112,6 +130,7 @@ def wheel_motion(
     """
     if not spec.use_odometry:
         return WheelMotion(history.increment, change_variance(history), jnp.ones(()))
+    odometry = odometry.at[:2].multiply(history.wheel_scale)
     variance = odometry_variance(spec, odometry)
     variance = jnp.where(guessed, variance + change_variance(history), variance)
     least = jnp.where(guessed, GUESSED_OUTLIER, 0.0)
@@ -201,11 +220,43 @@ def next_history(
     # One wrong match must not make leaps usual.
     change = jnp.clip(change, jnp.array(LEAST_CHANGE), MAX_STD * history.usual_change)
     contradiction = contradicted.astype(increment.dtype)
-    return MotionHistory(
-        increment,
-        MEMORY * history.usual_change + (1.0 - MEMORY) * change,
-        OUTLIER_MEMORY * history.contradicted + (1.0 - OUTLIER_MEMORY) * contradiction,
-        MEMORY * history.usual_inliers + (1.0 - MEMORY) * inlier_fraction,
+    return history._replace(
+        increment=increment,
+        usual_change=MEMORY * history.usual_change + (1.0 - MEMORY) * change,
+        contradicted=OUTLIER_MEMORY * history.contradicted + (1.0 - OUTLIER_MEMORY) * contradiction,
+        usual_inliers=MEMORY * history.usual_inliers + (1.0 - MEMORY) * inlier_fraction,
+    )
+
+
+def learn_scale(
+    history: MotionHistory, wheels: WheelMotion, increment: Array, information: Array, use: Array
+) -> MotionHistory:
+    """The history with the scale of the wheels as a scan shows it.
+
+    The distance ahead by the scan is m = s d + noise, with d that of the wheels and a variance that
+    is the sum of theirs and of the scan's; the last is what is left of the information when
+    sideways motion and turn are not known, less what tilted normals pretend.
+
+    Args:
+        history: Before.
+        wheels: What the wheels say, by the scale before.
+        increment: (3,) [m, m, rad] that the scan matcher found.
+        information: (3, 3) of the scan alone, in the same frame.
+        use: () bool, whether these wheels are to be learned from.
+    """
+    rest = information[1:, 1:] + jnp.diag(1.0 / wheels.variance[1:])
+    det = rest[0, 0] * rest[1, 1] - rest[0, 1] * rest[1, 0]
+    a, b = information[0, 1], information[0, 2]
+    explained = (a**2 * rest[1, 1] - 2.0 * a * b * rest[0, 1] + b**2 * rest[0, 0]) / det
+    pretended = SURFACE_TILT_STD**2 * (information[0, 0] + information[1, 1])
+    ahead = jnp.maximum(information[0, 0] - explained - pretended, 0.0)
+    ahead = ahead / (1.0 + ahead * wheels.variance[0])
+    distance = wheels.increment[0] / history.wheel_scale
+    gained = jnp.where(use, ahead * distance**2, 0.0)
+    off = ahead * distance * (increment[0] - wheels.increment[0])
+    total = history.scale_information + gained
+    return history._replace(
+        wheel_scale=history.wheel_scale + jnp.where(use, off, 0.0) / total, scale_information=total
     )
 
 

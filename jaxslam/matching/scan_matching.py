@@ -33,10 +33,12 @@ from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
 from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, fine_icp, icp
 from jaxslam.matching.motion_prior import (
+    GUESSED_OUTLIER,
     change_variance,
     contradicts,
     expected_motion,
     first_history,
+    learn_scale,
     need_a_look,
     next_history,
     pose_hypotheses,
@@ -197,6 +199,8 @@ def _match_scan(
         (1.0 - expected.odometry_weight) * change_variance(history),
         expected.odometry_weight,
     )
+    learn = finite & ~contradicted & (wheels.outlier_probability < GUESSED_OUTLIER)
+    history = learn_scale(history, wheels, increment, result.information, learn)
     history = next_history(history, increment, match.inlier_fraction, contradicted)
     return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), result
 

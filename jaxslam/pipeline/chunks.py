@@ -81,11 +81,13 @@ class ChunkResult(NamedTuple):
         info: Diagnostics of the filter.
         features: Features.
         scan_matches: Increments by scan matching; None where scans are not matched.
+        keyframes: (N,) int numbers in the log, of keyframes of a whole log; else None.
     """
 
     info: StepInfo
     features: Features
     scan_matches: ScanMatch | None
+    keyframes: np.ndarray | None = None
 
 
 class Chunk(NamedTuple):
@@ -137,6 +139,45 @@ def padded_chunk(odometry: np.ndarray, scans: Scan) -> tuple[Scan, Array, Array]
 
     padded_scans, increments = jax.tree.map(as_jax, pad_to((scans, odometry), to=CHUNK))
     return padded_scans, increments, jnp.int32(len(odometry))
+
+
+def match_chunk(
+    config: Config, submap: Submap, odometry: np.ndarray, scans: Scan
+) -> tuple[Submap, ScanMatch]:
+    """Submap after a chunk, and its increments [N] by scan matching, NumPy; waits for them.
+
+    Args:
+        config: Of the scanner and of scan matching.
+        submap: After the chunk before.
+        odometry: (N, 3) [m, m, rad] increments, NumPy.
+        scans: [N], NumPy.
+    """
+    lidar, given = config.frontend.lidar, padded_chunk(odometry, scans)
+    submap, matches = scan_matching.match_scans(config.scan_matching, lidar, submap, *given)
+    return submap, jax.tree.map(lambda x: np.asarray(x)[: len(odometry)], matches)
+
+
+def extract_matched(
+    config: Config,
+    submap: Submap | None,
+    odometry: np.ndarray,
+    scans: Scan,
+    matches: ScanMatch | None,
+) -> Chunk:
+    """Features and arcs of a chunk whose scans are matched, or are not to be; does not wait.
+
+    Args:
+        config: Of the front end.
+        submap: After the chunk; None if scans are not matched.
+        odometry: (N, 3) [m, m, rad] increments, NumPy.
+        scans: [N], NumPy.
+        matches: [N] increments by scan matching, NumPy; None if there are none.
+    """
+    padded_scans, increments, count = padded_chunk(odometry, scans)
+    features, local_arcs = extract.extract_local_graphs(config.frontend, padded_scans)
+    matches = jax.tree.map(jnp.asarray, pad_to(matches, to=CHUNK))
+    measurements = Measurement(increments, features, scan_match=matches)
+    return Chunk(count, padded_scans, measurements, local_arcs, submap)
 
 
 def extract_chunk(

@@ -154,7 +154,7 @@ def match_log(config: Config, odometry: Any, ranges: Any) -> ScanMatch:
     scans = arguments.as_scans(lidar, ranges, len(increments))
     submap, parts = scan_matching.empty_submap(spec, lidar), []
     for first in range(0, len(increments), chunks.CHUNK):
-        some = chunks.padded_chunk(*chunks.chunk_at(first, increments, scans))
-        submap, part = scan_matching.match_scans(spec, lidar, submap, *some)
+        some = chunks.chunk_at(first, increments, scans)
+        submap, part = chunks.match_chunk(config, submap, *some)
         parts.append(part)
-    return jax.tree.map(lambda *x: np.concatenate(x)[: len(increments)], *parts)
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

@@ -51,13 +51,23 @@ def write_maps(
     measurements: Measurement,
     scans: Scan,
 ) -> None:
-    """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml."""
-    grid = occupancy_map(config.frontend.lidar, result.poses, scans, resolution=MAP_RESOLUTION)
+    """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml.
+
+    Args:
+        out_dir: Folder to write to.
+        config: Configuration of the run.
+        params: Noise parameters of the filter.
+        result: Result of SLAM.
+        measurements: [K] inputs of the filter.
+        scans: [K] of the keyframes, which the occupancy grid is made of.
+    """
+    poses = result.poses[result.keyframes]
+    grid = occupancy_map(config.frontend.lidar, poses, scans, resolution=MAP_RESOLUTION)
     ros_map.write(out_dir / "map.yaml", grid)
     graph = pose_graph.build_pose_graph(
         config.filter,
         params,
-        result.poses[result.keyframes],
+        poses,
         result.belief,
         result.info,
         measurements,

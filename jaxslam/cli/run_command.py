@@ -174,8 +174,8 @@ def run(
         config = config._replace(  # the map has grown to its size, which the files are made for
             filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)
         )
-        report.write_maps(out_dir, config, params, result, measurements, scans)
         of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
+        report.write_maps(out_dir, config, params, result, measurements, of_keyframes)
         trajectories, error = {"odometry": odom_poses}, None
         if known is not None:
             trajectories["reference"] = log_errors.reference_in_map(

@@ -81,7 +81,7 @@ def choose_keyframes(
     chosen: list[bool] = []
     motion: Sequence[float] = AT_REST if before is None else before.tolist()
     for increment in np.asarray(increments, float).tolist():
-        motion = _composed(motion, increment)
+        motion = _compose_one(motion, increment)
         far = math.hypot(motion[0], motion[1]) > distance[0] or abs(motion[2]) > distance[1]
         chosen.append(far or (before is None and not chosen))
         if chosen[-1]:
@@ -92,7 +92,7 @@ def choose_keyframes(
 def motion_since_keyframe(increments: AnyArray, is_keyframe: np.ndarray) -> np.ndarray:
     """Motion (N, 3) [m, m, rad] since the last keyframe before each scan, in its frame.
 
-    At a keyframe this is the motion since the keyframe before: all increments since, composed.
+    At a keyframe this is the motion since the keyframe before, the product of all increments.
 
     Args:
         increments: (N, 3) [m, m, rad]; the first scan follows a keyframe, or begins the log.
@@ -100,11 +100,11 @@ def motion_since_keyframe(increments: AnyArray, is_keyframe: np.ndarray) -> np.n
     """
     motion = np.asarray(increments, float).tolist()
     for k in (np.flatnonzero(~is_keyframe[:-1]) + 1).tolist():
-        motion[k] = _composed(motion[k - 1], motion[k])
+        motion[k] = _compose_one(motion[k - 1], motion[k])
     return np.array(motion).reshape(-1, 3)
 
 
-def _composed(pose: Sequence[float], increment: Sequence[float]) -> Sequence[float]:
+def _compose_one(pose: Sequence[float], increment: Sequence[float]) -> Sequence[float]:
     """`se2_np.compose` of one pose, without the overhead of arrays."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     heading = pose[2] + increment[2]

@@ -107,7 +107,7 @@ def _part(matched: MatchedScans, start: int, end: int | None) -> MatchedScans:
 
 
 def concatenate(parts: list[Any]) -> Any:
-    """Records of arrays that lead with scans, one after the other, NumPy."""
+    """Arrays of several records that lead with scans, one after the other, NumPy."""
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 

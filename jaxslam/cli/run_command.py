@@ -70,11 +70,12 @@ def run(
 ) -> int:
     """Run SLAM on a laser log.
 
-    Writes metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson
-    and, with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for
-    map_server and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of
-    the first scan is the origin of the map. A WARNING names the scans where the map contradicts
-    itself, because the run was lost there; path.png marks them.
+    Every scan is matched; filter and maps are given keyframes, 0.3 m or 0.3 rad apart. Writes
+    metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson and,
+    with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for map_server
+    and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of the first
+    scan is the origin of the map. A WARNING names the scans where the map contradicts itself,
+    because the run was lost there; path.png marks them.
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is
@@ -199,7 +200,8 @@ def run(
                 result.poses[result.keyframes],
                 odom_poses[result.keyframes],
             )
-    summaries.print_summary(numbers, f"{len(result.poses)} scans of {log}", out)
+    size = f"{len(result.poses)} scans, {len(result.keyframes)} keyframes"
+    summaries.print_summary(numbers, f"{size} of {log}", out)
     return INCONSISTENT if strict and consistency.warnings else 0
 
 

@@ -6,6 +6,7 @@ Of logs with relations at whose times there are scans, so that no pose is interp
 
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from experiments import common, log_folder
@@ -14,6 +15,8 @@ from experiments.log_folder import Log
 from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.map_consistency import check_map
 from jaxslam.pipeline import log_input
+from jaxslam.pipeline.chunks import ChunkResult
+from jaxslam.pipeline.online import SlamState
 
 OWN, DEAD_RECKONING = "jaxslam", "dead reckoning"
 KEYS = ("translation_mean_m", "translation_std_m", "rotation_mean_deg", "rotation_std_deg")
@@ -74,7 +77,11 @@ def own_rows(log: Log) -> Numbers:
     pairs = log_folder.at_scans(laser_log.times, pairs)
     given = log_input.from_laser_log(laser_log)
     with tqdm(total=len(laser_log.times), unit="scan", leave=False, desc=log.name) as bar:
-        result = log_input.run(given, callback=lambda _, part: bar.update(len(part.info.finite)))
+
+        def show(_: SlamState, part: ChunkResult) -> None:
+            bar.update(int(np.asarray(part.keyframes)[-1]) + 1 - bar.n)
+
+        result = log_input.run(given, callback=show)
     found = check_map(given.config.frontend.lidar, result.poses, given.scans)
     estimates = {OWN: result.poses, DEAD_RECKONING: given.odom_poses}
     rows = []

@@ -85,6 +85,7 @@ def extract(log: Log) -> Extracted:
     """Features and scan matches of a log, and the time to map it on one core."""
     laser_log = log.laser_log
     config = Config.for_laser_log(laser_log.lidar)
+    config = config._replace(keyframe_distance=None)  # the episode holds every scan
     odometry = increments(laser_log.odom_poses)
     truth, truth_mask = np.zeros(odometry.shape, np.float32), np.zeros(len(odometry), bool)
     if log.reference is not None:

@@ -51,13 +51,23 @@ def write_maps(
     measurements: Measurement,
     scans: Scan,
 ) -> None:
-    """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml."""
-    grid = occupancy_map(config.frontend.lidar, result.poses, scans, resolution=MAP_RESOLUTION)
+    """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml.
+
+    Args:
+        out_dir: Folder to write to.
+        config: Configuration of the run.
+        params: Noise parameters of the filter.
+        result: Result of SLAM.
+        measurements: [K] inputs of the filter.
+        scans: [K] of the keyframes, which the occupancy grid is made of.
+    """
+    poses = result.poses[result.keyframes]
+    grid = occupancy_map(config.frontend.lidar, poses, scans, resolution=MAP_RESOLUTION)
     ros_map.write(out_dir / "map.yaml", grid)
     graph = pose_graph.build_pose_graph(
         config.filter,
         params,
-        result.poses,
+        poses,
         result.belief,
         result.info,
         measurements,
@@ -122,9 +132,9 @@ def draw(
         config: Configuration of the filter.
         result: Result of SLAM.
         lines: Other trajectories (N, 3) by their name in `TRAJECTORY_STYLES`.
-        error: (T, 3) pose errors [m, m, rad], if known.
+        error: (K, 3) pose errors [m, m, rad] of the keyframes, if known.
         world: World whose walls are drawn.
-        scans: Scans [T] whose end points are drawn.
+        scans: Scans [K] of the keyframes, whose end points are drawn.
         wrong: First and last number of scans where the map contradicts itself.
     """
     # Imported here, because matplotlib is slow to import.
@@ -141,7 +151,7 @@ def draw(
         maps.draw_walls(axis, world)
     if scans is not None:
         points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
-        maps.draw_hits(axis, poses, np.asarray(points), np.asarray(scans.hit))
+        maps.draw_hits(axis, poses[result.keyframes], np.asarray(points), np.asarray(scans.hit))
     for what, line in (lines | {"estimate": poses}).items():
         maps.draw_trajectory(axis, line, what)
     maps.draw_wrong_parts(axis, poses, wrong)
@@ -152,7 +162,7 @@ def draw(
     figure.savefig(out_dir / "path.png")
 
     figure, axes = canvas.canvas(9.0, 6.0, 3)
-    charts.draw_errors(axes[:, 0], np.asarray(result.info.pose_cov), error)
+    charts.draw_errors(axes[:, 0], np.asarray(result.info.pose_cov), error, result.keyframes)
     figure.savefig(out_dir / "errors.png")
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
@@ -66,11 +67,12 @@ def run(
 ) -> int:
     """Run SLAM on a laser log.
 
-    Writes metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson
-    and, with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for
-    map_server and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of
-    the first scan is the origin of the map. A WARNING names the scans where the map contradicts
-    itself, because the run was lost there; path.png marks them.
+    Every scan is matched; filter and maps are given keyframes, 0.3 m or 0.3 rad apart. Writes
+    metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson and,
+    with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for map_server
+    and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of the first
+    scan is the origin of the map. A WARNING names the scans where the map contradicts itself,
+    because the run was lost there; path.png marks them.
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is
@@ -126,6 +128,7 @@ def run(
             result = _run_slam(given, params, smooth=smooth, viewer=viewer)
         numbers = {
             "scans": len(result.poses),
+            "keyframes": len(result.keyframes),
             "skipped_lines": laser_log.num_skipped,
             "mended": [*given.notes, *reference_notes, *result.notes],
             "odometry": given.odometry_source,
@@ -151,7 +154,8 @@ def run(
         config = config._replace(  # the map has grown to its size, which the files are made for
             filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)
         )
-        report.write_maps(out_dir, config, params, result, measurements, scans)
+        of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
+        report.write_maps(out_dir, config, params, result, measurements, of_keyframes)
         trajectories, error = {"odometry": odom_poses}, None
         if known is not None:
             trajectories["reference"] = log_errors.reference_in_map(
@@ -160,16 +164,23 @@ def run(
             if log_errors.has_heading(known):
                 error = _online_errors(laser_log, result, known)
         wrong = [(warning.first_scan, warning.last_scan) for warning in consistency.warnings]
-        report.draw(out_dir, config, result, trajectories, error, scans=scans, wrong=wrong)
+        report.draw(out_dir, config, result, trajectories, error, scans=of_keyframes, wrong=wrong)
         if scan is not None:
             report.draw_scan(out_dir / "scan.png", config, scans, scan)
         if gif:
             from jaxslam.viz import animation  # imported here, because matplotlib is slow to import
 
             animation.animate_run(
-                out_dir / "run.gif", config, params, measurements, scans, result.poses, odom_poses
+                out_dir / "run.gif",
+                config,
+                params,
+                measurements,
+                of_keyframes,
+                result.poses[result.keyframes],
+                odom_poses[result.keyframes],
             )
-    summaries.print_summary(numbers, f"{len(result.poses)} scans of {log}", out)
+    size = f"{len(result.poses)} scans, {len(result.keyframes)} keyframes"
+    summaries.print_summary(numbers, f"{size} of {log}", out)
     return INCONSISTENT if strict and consistency.warnings else 0
 
 
@@ -189,17 +200,16 @@ def _errors(
     if reference is not None or relations is not None:
         numbers |= log_errors.errors_against(laser_log, result.poses, reference, relations)
         if smooth:
-            online_poses = np.asarray(result.info.pose, np.float64)
             numbers["filter"] = log_errors.errors_against(
-                laser_log, online_poses, reference, relations
+                laser_log, result.online_poses, reference, relations
             )
     return numbers
 
 
 def _online_errors(laser_log: LaserLog, result: SlamResult, reference: Trajectory) -> np.ndarray:
-    """Errors (T, 3) [m, m, rad] of the online estimates since the first scan."""
-    online_poses = np.asarray(result.info.pose, np.float64)
-    return log_errors.errors_since_start(laser_log.times, online_poses, reference)
+    """Errors (K, 3) [m, m, rad] of the online estimates of keyframes since the first scan."""
+    times, poses = laser_log.times, result.online_poses
+    return log_errors.errors_since_start(times, poses, reference)[result.keyframes]
 
 
 def _run_slam(
@@ -210,11 +220,12 @@ def _run_slam(
     with tqdm(total=num_scans, unit="scan", desc="compiling", mininterval=0.2) as bar:
 
         def show_progress(state: SlamState, chunk: ChunkResult) -> None:
-            done = bar.n + len(chunk.info.finite) == num_scans
+            num_done = int(np.asarray(chunk.keyframes)[-1]) + 1
+            done = num_done == num_scans
             bar.set_description("smoothing" if done and smooth else "mapping", refresh=False)
             num_landmarks = int(np.sum(confirmed(given.config.filter, state.belief)))
             bar.set_postfix_str(f"{num_landmarks} landmarks", refresh=False)
-            bar.update(len(chunk.info.finite))
+            bar.update(num_done - bar.n)
             if viewer is not None:
                 viewer.watch(state, chunk)
 

@@ -81,11 +81,13 @@ class ChunkResult(NamedTuple):
         info: Diagnostics of the filter.
         features: Features.
         scan_matches: Increments by scan matching; None where scans are not matched.
+        keyframes: (N,) int numbers in the log, of keyframes of a whole log; else None.
     """
 
     info: StepInfo
     features: Features
     scan_matches: ScanMatch | None
+    keyframes: np.ndarray | None = None
 
 
 class Chunk(NamedTuple):
@@ -139,12 +141,53 @@ def padded_chunk(odometry: np.ndarray, scans: Scan) -> tuple[Scan, Array, Array]
     return padded_scans, increments, jnp.int32(len(odometry))
 
 
+def match_chunk(
+    config: Config, submap: Submap, odometry: np.ndarray, scans: Scan, guessed: np.ndarray
+) -> tuple[Submap, ScanMatch]:
+    """Submap after a chunk, and its increments [N] by scan matching, NumPy; waits for them.
+
+    Args:
+        config: Of the scanner and of scan matching.
+        submap: After the chunk before.
+        odometry: (N, 3) [m, m, rad] increments, NumPy.
+        scans: [N], NumPy.
+        guessed: (N,) bool, which increments are guesses of the reader.
+    """
+    lidar, given = config.frontend.lidar, padded_chunk(odometry, scans)
+    submap, matches = scan_matching.match_scans(
+        config.scan_matching, lidar, submap, *given, guessed=pad_to(guessed, to=CHUNK)
+    )
+    return submap, jax.tree.map(lambda x: np.asarray(x)[: len(odometry)], matches)
+
+
+def extract_matched(
+    config: Config,
+    submap: Submap | None,
+    odometry: np.ndarray,
+    scans: Scan,
+    matches: ScanMatch | None,
+) -> Chunk:
+    """Features and arcs of a chunk whose scans are matched, or are not to be; does not wait.
+
+    Args:
+        config: Of the front end.
+        submap: After the chunk; None if scans are not matched.
+        odometry: (N, 3) [m, m, rad] increments, NumPy.
+        scans: [N], NumPy.
+        matches: [N] increments by scan matching, NumPy; None if there are none.
+    """
+    padded_scans, increments, count = padded_chunk(odometry, scans)
+    features, local_arcs = extract.extract_local_graphs(config.frontend, padded_scans)
+    matches = jax.tree.map(jnp.asarray, pad_to(matches, to=CHUNK))
+    measurements = Measurement(increments, features, scan_match=matches)
+    return Chunk(count, padded_scans, measurements, local_arcs, submap)
+
+
 def extract_chunk(
     config: Config,
     submap: Submap | None,
     odometry: np.ndarray,
     scans: Scan,
-    guessed: np.ndarray | None = None,
 ) -> Chunk:
     """Features, arcs and, with a submap of the scan matcher, matched increments of a chunk.
 
@@ -153,11 +196,8 @@ def extract_chunk(
         submap: After the chunk before; None if scans are not matched.
         odometry: (N, 3) [m, m, rad] increments, NumPy.
         scans: [N], NumPy.
-        guessed: (N,) bool, which increments are guesses; None for none.
     """
     padded_scans, increments, count = padded_chunk(odometry, scans)
-    if guessed is not None:
-        guessed = pad_to(guessed, to=CHUNK)
     matches = None
     with ThreadPoolExecutor(1) as worker:  # beside the matching, see the module's diagram
         run = with_settings(extract.extract_local_graphs)
@@ -170,7 +210,6 @@ def extract_chunk(
                 padded_scans,
                 increments,
                 count,
-                guessed=guessed,
             )
         features, local_arcs = extracted.result()
     measurements = Measurement(increments, features, scan_match=matches)

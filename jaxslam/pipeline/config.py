@@ -12,9 +12,11 @@ from jaxslam.frontend.lidar import field_of_view
 from jaxslam.matching.checks import check_scan_match_spec
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.registration import LoopClosureSpec, check_loop_closure_spec
+from jaxslam.pipeline import keyframes
 
 MAX_LANDMARKS = 2048  # default capacity for landmarks: a building with some kilometres of corridors
 LOG_CONFIRM_COUNT = 3  # real buildings have clutter that looks like a landmark once or twice
+LOG_KEYFRAME_DISTANCE = (0.3, 0.3)  # [m], [rad] little of a scanner's view changes over it
 FRONTEND, FILTER = FrontendConfig(), FilterConfig()  # the defaults
 SCAN_MATCHING, LOOP_CLOSURE = ScanMatchSpec(), LoopClosureSpec()
 
@@ -29,12 +31,16 @@ class Config(NamedTuple):
         filter: The EKF-SLAM filter.
         scan_matching: Scan matching, where odometry is fused with it.
         loop_closure: Loop closures, for batch smoothing.
+        keyframe_distance: [m], [rad] matched motion since the last keyframe that makes a scan of a
+            log a keyframe, if it exceeds one of both; other scans are only matched. None: every
+            scan is a keyframe.
     """
 
     frontend: FrontendConfig = FRONTEND
     filter: FilterConfig = FILTER
     scan_matching: ScanMatchSpec = SCAN_MATCHING
     loop_closure: LoopClosureSpec = LOOP_CLOSURE
+    keyframe_distance: tuple[float, float] | None = None
 
     @classmethod
     def for_lidar(
@@ -45,6 +51,7 @@ class Config(NamedTuple):
         filter: FilterConfig = FILTER,  # noqa: A002, as the field is called
         scan_matching: ScanMatchSpec = SCAN_MATCHING,
         loop_closure: LoopClosureSpec = LOOP_CLOSURE,
+        keyframe_distance: tuple[float, float] | None = None,
     ) -> "Config":
         """Configuration for a scanner: front end and filter know it alike.
 
@@ -54,6 +61,7 @@ class Config(NamedTuple):
             filter: The rest of the filter.
             scan_matching: Of the configuration.
             loop_closure: Of the configuration.
+            keyframe_distance: Of the configuration.
 
         Raises:
             ValueError: The scanner is impossible.
@@ -64,6 +72,7 @@ class Config(NamedTuple):
             filter._replace(field_of_view=field_of_view(lidar)),
             scan_matching,
             loop_closure,
+            keyframe_distance,
         )
 
     @classmethod
@@ -75,7 +84,7 @@ class Config(NamedTuple):
             max_landmarks: L, capacity of the map; `run_slam` takes slots as they are needed.
         """
         own = FilterConfig(max_landmarks=max_landmarks, confirm_count=LOG_CONFIRM_COUNT)
-        return cls.for_lidar(lidar, filter=own)
+        return cls.for_lidar(lidar, filter=own, keyframe_distance=LOG_KEYFRAME_DISTANCE)
 
     @classmethod
     def for_landmark_sensor(cls, num_landmarks: int, max_measurements: int) -> "Config":
@@ -109,6 +118,7 @@ class Config(NamedTuple):
         filter_config.check_config(self.filter)
         check_scan_match_spec(self.scan_matching, "config.scan_matching")
         check_loop_closure_spec(self.loop_closure)
+        keyframes.check_distance(self.keyframe_distance)
         own, scanner = self.filter.field_of_view, field_of_view(self.frontend.lidar)
         if own != scanner:
             raise ValueError(

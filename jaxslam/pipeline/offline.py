@@ -1,6 +1,7 @@
-"""SLAM on a whole log: chunks of scans, then batch smoothing with loop closures."""
+"""SLAM on a whole log: chunks of keyframes, then batch smoothing with loop closures."""
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import jax
@@ -20,16 +21,18 @@ from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching import loop_closure
 from jaxslam.matching.latched_odometry import share_out_leaps
 from jaxslam.matching.loop_closure import LoopClosures
-from jaxslam.pipeline import arguments, chunks, online
+from jaxslam.pipeline import arguments, keyframes, online, stages
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.online import SlamState
+from jaxslam.pipeline.stages import MatchedScans
 from jaxslam.smoothing import numbering, sparse
 from jaxslam.smoothing import problem as smoothing_problem
 from jaxslam.smoothing.problem import SmoothingProblem, SmoothingResult
 
 # Searches for loop closures at most, each from the trajectory smoothed before it.
 MAX_CLOSURE_ROUNDS = 2
+MIN_WRONG_SCALE = 0.025  # of the wheels' distances, from which it is noted
 MIN_CONTRADICTED = 0.01  # fraction of the scans from which contradictions are noted
 CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further than this
 # Numbers of scans and landmarks are padded to multiples of this to be smoothed.
@@ -41,23 +44,31 @@ _build_problem = trace_cache.jit(
 
 
 class SlamResult(NamedTuple):
-    """Result of SLAM on a log of T scans.
+    """Result of SLAM on a log of T scans, K of which are keyframes.
 
     Attributes:
         poses: (T, 3) float64 [m, m, rad] estimated trajectory, map frame: filtered, or smoothed.
+        online_poses: (T, 3) float64 [m, m, rad] estimates at the time: those of the filter, and
+            between keyframes the matched motion since.
+        keyframes: (K,) int numbers of the keyframes, which the filter was given; the first and the
+            last scan are among them. All scans where `config.keyframe_distance` is None.
         belief: Of the filter after the last scan; if smoothed, with the smoothed last pose and
             landmark positions, and still the covariance of the filter.
-        info: [T] diagnostics of the filter, with its estimates at the time.
-        features: [T] features.
+        info: [K] diagnostics of the filter, with its estimates at the time.
+        features: [K] features.
         topological_map: Topological map.
-        scan_matches: [T] increments by scan matching, where scans were matched.
-        loop_closures: Loop closures that the trajectory was smoothed with, where there were any.
-        odometry: (T, 3) [m, m, rad] increments that the filter was given: repaired, or zero where
-            odometry is not used.
+        scan_matches: [K] increments by scan matching since the keyframe before, where scans were
+            matched.
+        loop_closures: Loop closures that the trajectory was smoothed with, where there were any;
+            they are between keyframes, by their index 0 .. K - 1.
+        odometry: (K, 3) [m, m, rad] increments since the keyframe before that the filter was given:
+            repaired, or zero where odometry is not used.
         notes: What was wrong with the odometry, to be printed.
     """
 
     poses: np.ndarray
+    online_poses: np.ndarray
+    keyframes: np.ndarray
     belief: Belief
     info: StepInfo
     features: Features
@@ -82,6 +93,11 @@ def run_slam(
 ) -> SlamResult:
     """Run SLAM on a whole log.
 
+    Every scan is matched, in order; front end, filter and smoother work on keyframes, which are
+    chosen by the matched motion (`config.keyframe_distance`), and the poses of the scans between
+    them follow from their own matched motion (`keyframes`). Without scan matching every scan is a
+    keyframe.
+
     The filter estimates each pose from the measurements up to it. With `smooth`, all poses and
     landmarks are estimated from all measurements (`sparse.smooth_log`), and where scans are
     matched, loops are closed by matching scans of later visits with those of earlier ones
@@ -100,7 +116,7 @@ def run_slam(
             the log, not what the wheels said (`LaserLog.odometry_guessed`); none by default.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
-        callback: Called after each chunk with the state and the result of the chunk.
+        callback: Called after each chunk of keyframes with the state and the result of the chunk.
 
     Raises:
         ValueError: An argument has another shape, or does not fit the others; the odometry holds
@@ -120,46 +136,54 @@ def run_slam(
     elif match_scans:
         increments = np.zeros_like(increments)
     state, parts = online.init(config, pose, match_scans=match_scans), []
-    following = chunks.extract_chunk(
-        config, state.submap, *chunks.chunk_at(0, increments, scans), guessed[: chunks.CHUNK]
-    )
-    for first in range(0, len(increments), chunks.CHUNK):
-        chunk, after = following, first + chunks.CHUNK
-        if after < len(increments):  # in the background while the filter works on this chunk
-            some = chunks.chunk_at(after, increments, scans)
-            some_guessed = guessed[after : after + chunks.CHUNK]
-            following = chunks.extract_chunk(config, chunk.submap, *some, some_guessed)
-        state, part = online.advance(config, params, state, chunk)
-        parts.append(part)
-        if callback is not None:
-            callback(state, part)
-    info, features, matches = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    poses, closures = np.asarray(info.pose, np.float64), None
+    log = stages.keyframe_chunks(config, state.submap, increments, scans, guessed)
+    odometry_parts, matched_parts = [], []
+    with closing(log):  # whatever happens, no scans are matched any more after it
+        following = next(log, None)
+        while following is not None:
+            now, following = following, next(log, None)  # in the background of the filter
+            state, part = online.advance(config, params, state, now.chunk)
+            odometry_parts.append(now.odometry)
+            matched_parts.append(now.matched)
+            parts.append(part._replace(keyframes=now.keyframes))
+            if callback is not None:
+                callback(state, parts[-1])
+    info, features, matches, numbers = stages.concatenate(parts)
+    keyframe_odometry, matched = np.concatenate(odometry_parts), stages.concatenate(matched_parts)
+    motion = keyframes.motion_since_keyframe(matched.increments, matched.is_keyframe)
+    keyframe_poses, closures = np.asarray(info.pose, np.float64), None
+    online_poses = keyframes.poses_since_keyframes(keyframe_poses, matched.is_keyframe, motion)
+    poses = online_poses
     if smooth:
-        own: Any = increments.astype(info.pose.dtype)  # NumPy, like the rest
-        measurements = Measurement(own, features, scan_match=matches)
-        poses, belief, closures = smooth_result(
+        own: Any = keyframe_odometry.astype(info.pose.dtype)  # NumPy, like the rest
+        keyframe_poses, belief, closures = smooth_result(
             config,
             params,
             pose,
-            measurements,
+            Measurement(own, features, scan_match=matches),
             info,
             state.belief,
-            scans if match_scans else None,
+            jax.tree.map(lambda x: x[numbers], scans) if match_scans else None,
         )
         state = state._replace(belief=belief)
-    topological_map = online.topological_map(config, state, poses)
+        poses = keyframes.interpolate_poses(
+            keyframe_poses, matched.is_keyframe, motion, matched.increments
+        )
+    topological_map = online.topological_map(config, state, keyframe_poses)
     if match_scans and config.scan_matching.use_odometry:
-        notes += _contradictions(np.asarray(matches.odometry_weight))
+        notes += _contradictions(np.asarray(matched.matches.odometry_weight))
+        notes += _wrong_scale(matched)
     return SlamResult(
         poses,
+        online_poses,
+        numbers,
         state.belief,
         info,
         features,
         topological_map,
         matches,
         closures,
-        increments,
+        keyframe_odometry,
         notes,
     )
 
@@ -178,6 +202,19 @@ def _contradictions(odometry_weight: np.ndarray) -> tuple[str, ...]:
         return ()
     note = f"contradicted by scan matching at {contradicted} of {len(odometry_weight)} scans"
     return (f"{note}, where it is not used",)
+
+
+def _wrong_scale(matched: MatchedScans) -> tuple[str, ...]:
+    """A note if scans show that the wheels report distances clearly too long or too short."""
+    late = slice(len(matched.odometry) // 2, None)  # when it has been learned
+    used = np.asarray(matched.matches.odometry_weight)[late] > 0.99
+    wheels = matched.odometry[late, 0][used]
+    learned = np.asarray(matched.matches.expected, float)[late, 0][used]
+    scale = np.sum(wheels * learned) / max(np.sum(wheels**2), 1e-12) if used.any() else 1.0
+    if abs(scale - 1.0) < MIN_WRONG_SCALE or not np.any(wheels):
+        return ()
+    percent, what = 100.0 * abs(1.0 / scale - 1.0), "long" if scale < 1.0 else "short"
+    return (f"wheels report distances {percent:.0f} % too {what}, corrected by scan matching",)
 
 
 def smooth_result(

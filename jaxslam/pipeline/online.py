@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import pad_to
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Lidar
@@ -159,8 +158,8 @@ def match_log(
     guessed = arguments.as_guessed(odometry_guessed, len(increments))
     submap, parts = scan_matching.empty_submap(spec, lidar), []
     for first in range(0, len(increments), chunks.CHUNK):
-        some = chunks.padded_chunk(*chunks.chunk_at(first, increments, scans))
-        some_guessed = pad_to(guessed[first : first + chunks.CHUNK], to=chunks.CHUNK)
-        submap, part = scan_matching.match_scans(spec, lidar, submap, *some, guessed=some_guessed)
+        some = chunks.chunk_at(first, increments, scans)
+        some_guessed = guessed[first : first + chunks.CHUNK]
+        submap, part = chunks.match_chunk(config, submap, *some, some_guessed)
         parts.append(part)
-    return jax.tree.map(lambda *x: np.concatenate(x)[: len(increments)], *parts)
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

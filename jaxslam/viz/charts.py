@@ -11,7 +11,10 @@ from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, NUM_SIGMAS, ORANGE, PIN
 
 
 def draw_errors(
-    axes: Sequence[Axes] | np.ndarray, cov: AnyArray, error: AnyArray | None = None
+    axes: Sequence[Axes] | np.ndarray,
+    cov: AnyArray,
+    error: AnyArray | None = None,
+    scans: AnyArray | None = None,
 ) -> None:
     """Draw the errors of heading, y and x with their 3-sigma bounds over the scans.
 
@@ -19,6 +22,7 @@ def draw_errors(
         axes: (3,) axes, top to bottom.
         cov: (T, 3, 3) pose covariance [m, m, rad].
         error: (T, 3) pose error [m, m, rad]; None: only the bounds are drawn.
+        scans: (T,) number of each scan in the log; by default 0 .. T - 1.
 
     Raises:
         ValueError: An argument has another shape.
@@ -31,7 +35,7 @@ def draw_errors(
     cov = as_float64("cov", cov, ("T", 3, 3))
     error = None if error is None else as_float64("error", error, (len(cov), 3))
     bound = NUM_SIGMAS * np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))  # (T, 3)
-    scan = np.arange(len(bound))
+    scan = np.arange(len(bound)) if scans is None else as_float64("scans", scans, (len(cov),))
     rows = (("heading [deg]", 2, 180 / np.pi), ("y [m]", 1, 1.0), ("x [m]", 0, 1.0))
     for axis, (name, column, factor) in zip(axes, rows, strict=True):
         high = factor * bound[:, column]
@@ -41,7 +45,7 @@ def draw_errors(
         if error is not None:
             axis.plot(scan, factor * error[:, column], color=BLACK, linewidth=1.2, label="error")
         axis.axhline(0.0, color=GREY, linewidth=0.6)
-        axis.set(ylabel=name, xlim=(0, max(len(scan) - 1, 1)))
+        axis.set(ylabel=name, xlim=(0, max(scan.max(initial=0), 1)))
         axis.margins(y=0.08)
     axes[-1].set_xlabel("scan")
     axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)

@@ -57,18 +57,18 @@ class RerunView:
         self._log("", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def watch(self, state: SlamState, chunk: ChunkResult) -> None:
-        """Show the scans of a chunk at their estimated poses, and the landmarks after the chunk.
+        """Show the keyframes of a chunk at their estimated poses, and the landmarks after it.
 
         Args:
             state: State of SLAM after the chunk.
-            chunk: Results of the chunk.
+            chunk: Results of the chunk, with the numbers of its keyframes.
         """
         from rerun import Arrows3D, Points3D
 
         from jaxslam.viz.canvas import BLUE, ORANGE
 
-        for pose in np.asarray(chunk.info.pose, np.float64):
-            scan = len(self._poses)
+        poses = np.asarray(chunk.info.pose, np.float64)
+        for scan, pose in zip(np.asarray(chunk.keyframes).tolist(), poses, strict=True):
             self._poses = np.concatenate([self._poses, pose[None]])
             self._stream.set_time("scan", sequence=scan)
             self._stream.set_time("time", duration=float(self._times[scan] - self._times[0]))

@@ -149,8 +149,11 @@ def test_the_preset_for_logs_is_that_of_the_command_line():
     assert CONFIG.filter.max_landmarks == MAX_LANDMARKS == 2048
     assert CONFIG.filter.confirm_count == LOG_CONFIRM_COUNT == 3
     assert CONFIG == Config.for_lidar(
-        LIDAR, filter=FilterConfig(max_landmarks=2048, confirm_count=3)
+        LIDAR,
+        filter=FilterConfig(max_landmarks=2048, confirm_count=3),
+        keyframe_distance=(0.3, 0.3),
     )
+    assert Config.for_lidar(LIDAR).keyframe_distance is None
 
 
 @pytest.mark.parametrize(
@@ -163,6 +166,10 @@ def test_the_preset_for_logs_is_that_of_the_command_line():
         (lambda: Config(filter=FilterConfig(max_landmarks=0)), "max_landmarks is 0"),
         (lambda: Config(scan_matching=ScanMatchSpec(window_scans=0)), "window_scans is 0"),
         (lambda: Config(loop_closure=LoopClosureSpec(submap_scans=0)), "submap_scans is 0"),
+        (lambda: Config(keyframe_distance=(0.3, 0.0)), r"keyframe_distance is \(0.3, 0.0\)"),
+        (lambda: Config(keyframe_distance=(-0.3, 0.3)), "not a tuple of two positive numbers"),
+        (lambda: Config(keyframe_distance=(math.nan, 0.3)), "keyframe_distance"),
+        (lambda: Config(keyframe_distance=0.3), "keyframe_distance is 0.3"),
     ],
 )
 def test_a_configuration_that_is_not_possible_is_refused(make, line):

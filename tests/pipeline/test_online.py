@@ -1,4 +1,5 @@
 import re
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -6,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam.core import se2_np
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2 import unit_vector
@@ -222,6 +224,97 @@ def test_increments_by_scan_matching_alone_are_those_of_slam(drive, results):
     assert_close(online.match_log(CONFIG, *drive), results[True][0].scan_matches)
 
 
+KEYFRAME_DISTANCE = (0.3, 0.3)  # the drive's steps are of 0.2 m and 0.2 rad: every second scan
+
+
+@pytest.fixture(scope="module")
+def with_keyframes(drive):
+    """Result of SLAM on keyframes, not smoothed, and what the callback was given."""
+    config, after = CONFIG._replace(keyframe_distance=KEYFRAME_DISTANCE), []
+
+    def callback(*state_and_part):
+        after.append(state_and_part)
+
+    found = offline.run_slam(config, PARAMS, *drive, start=START, smooth=False, callback=callback)
+    return found, after
+
+
+def test_the_filter_is_given_keyframes_alone(drive, results, with_keyframes):
+    (found, after), every = with_keyframes, results[True][0]
+    assert found.keyframes.tolist() == [0, 2, 4, 6, 8, 10]
+    assert_close(found.features, jax.tree.map(lambda x: x[found.keyframes], every.features))
+    wheels = se2_np.dead_reckoning(np.zeros(3), drive[0])
+    by_scans = se2_np.dead_reckoning(np.zeros(3), every.scan_matches.increment)
+    for poses, given in ((wheels, found.odometry), (by_scans, found.scan_matches.increment)):
+        np.testing.assert_allclose(given, increments(poses[found.keyframes]), atol=1e-9)
+    measurements = Measurement(
+        jnp.asarray(found.odometry),
+        jax.tree.map(jnp.asarray, found.features),
+        scan_match=jax.tree.map(jnp.asarray, found.scan_matches),
+    )
+    _, info = slam_filter.run_filter(
+        CONFIG.filter, PARAMS, filter_config.init(CONFIG.filter, START), measurements
+    )
+    np.testing.assert_allclose(found.info.pose, info.pose, atol=1e-9)
+    assert [part.keyframes.tolist() for _, part in after] == [[0, 2, 4, 6], [8, 10]]
+    np.testing.assert_array_equal(after[0][0].belief.pose, found.info.pose[3])
+
+
+def test_scans_between_keyframes_have_poses_by_their_own_motion(drive, with_keyframes):
+    found, _ = with_keyframes
+    np.testing.assert_array_equal(found.online_poses[found.keyframes], found.info.pose)
+    np.testing.assert_array_equal(found.poses, found.online_poses)
+    matched = online.match_log(CONFIG, *drive).increment
+    for t in range(1, T, 2):
+        want = se2_np.compose(found.poses[t - 1], matched[t])
+        np.testing.assert_allclose(found.poses[t], want, atol=1e-9)
+
+
+def test_a_smoothed_drive_on_keyframes_is_as_good_as_on_every_scan(drive, monkeypatch):
+    """One scan of this drive is matched 0.14 m off; keyframes are not drawn after it."""
+    monkeypatch.setattr(offline, "PADDING_MULTIPLE", 8)
+    turn = np.linspace(0.0, 2.0, T)
+    true = np.stack([np.cos(turn), np.sin(turn), turn + np.pi / 2], axis=1)
+    errors = []
+    for distance in (None, KEYFRAME_DISTANCE):
+        config = CONFIG._replace(keyframe_distance=distance)
+        found = offline.run_slam(config, PARAMS, *drive, start=START)
+        error = relative(relative(true[0], true), relative(found.poses[0], found.poses))
+        errors.append(np.hypot(error[:, 0], error[:, 1]))
+    assert errors[1].max() < errors[0].max() < 0.2
+    assert errors[1][found.keyframes].max() < 0.03
+
+
+def test_without_scan_matching_every_scan_is_a_keyframe(drive, results, monkeypatch):
+    monkeypatch.setattr(chunks, "SLOT_BLOCK", CONFIG.filter.max_landmarks)
+    config = CONFIG._replace(keyframe_distance=KEYFRAME_DISTANCE)
+    plain = offline.run_slam(config, PARAMS, *drive, start=START, match_scans=False, smooth=False)
+    np.testing.assert_array_equal(plain.keyframes, np.arange(T))
+    np.testing.assert_allclose(plain.poses, results[False][0].poses, atol=1e-9)
+
+
+def test_nothing_is_matched_any_more_after_a_run_that_fails(drive, monkeypatch):
+    matched = []
+
+    def match(config, submap, odometry, scans):
+        matched.append(len(odometry))
+        time.sleep(0.05)
+        return submap, scan_matches
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    scan_matches = online.match_log(CONFIG, *jax.tree.map(lambda x: x[:4], drive))
+    monkeypatch.setattr(chunks, "match_chunk", match)
+    long = jax.tree.map(lambda x: np.concatenate([x[:4]] * 50), drive)
+    long[0][0] = 0.0
+    with pytest.raises(KeyboardInterrupt):
+        online_slam(long, callback=fail)
+    count = len(matched)
+    time.sleep(0.2)
+    assert len(matched) == count < 50
+
+
 def compiled(caplog, run):
     """Names of the programs that a function compiles, in all threads."""
     caplog.clear()
@@ -237,6 +330,9 @@ def compiled(caplog, run):
 def test_a_log_of_another_length_needs_no_other_program(drive, results, caplog):
     odometry, scans = jax.tree.map(lambda x: x[:6], drive)
     names = compiled(caplog, lambda: online_slam((odometry, scans)))
+    assert not {"extract_local_graphs", "match_scans", "_steps", "_init"} & set(names)
+    config = CONFIG._replace(keyframe_distance=KEYFRAME_DISTANCE)
+    names = compiled(caplog, lambda: offline.run_slam(config, PARAMS, *drive, smooth=False))
     assert not {"extract_local_graphs", "match_scans", "_steps", "_init"} & set(names)
     one = jax.tree.map(lambda x: jnp.asarray(x[:1]), scans)
     names = compiled(caplog, lambda: extract.extract_local_graphs(CONFIG.frontend, one))

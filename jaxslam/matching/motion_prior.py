@@ -12,10 +12,10 @@ is how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, 
 `GUESSED_OUTLIER` where the log itself says that an increment is a guess. The quick match needs one
 Gaussian near the right place: both are combined by their information, weighted by 1 - o and o.
 
-Wheels may also be wrong in the same way all the time: a tyre that is worn or soft makes every
-distance some percent too long. What the scans say of it is learned on the way, by a Kalman filter
-of one number, the scale, from scans that show the motion ahead; where a corridor does not, they
-are used with the scale that was learned before.
+Wheels may also be wrong by the same factor all the time: a tyre that is worn or soft makes every
+distance some percent too long. The scale is learned during the drive, by a Kalman filter of one
+number, from scans that show the motion ahead; where a corridor does not, the wheels are used with
+what was learned before.
 """
 
 from typing import NamedTuple

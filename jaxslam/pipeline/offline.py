@@ -19,21 +19,17 @@ from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching import loop_closure
-from jaxslam.matching.latched_odometry import share_out_leaps
 from jaxslam.matching.loop_closure import LoopClosures
-from jaxslam.pipeline import arguments, keyframes, online, stages
+from jaxslam.pipeline import arguments, keyframes, odometry_notes, online, stages
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.online import SlamState
-from jaxslam.pipeline.stages import MatchedScans
 from jaxslam.smoothing import numbering, sparse
 from jaxslam.smoothing import problem as smoothing_problem
 from jaxslam.smoothing.problem import SmoothingProblem, SmoothingResult
 
 # Searches for loop closures at most, each from the trajectory smoothed before it.
 MAX_CLOSURE_ROUNDS = 2
-MIN_WRONG_SCALE = 0.025  # of the wheels' distances, from which it is noted
-MIN_CONTRADICTED = 0.01  # fraction of the scans from which contradictions are noted
 CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further than this
 # Numbers of scans and landmarks are padded to multiples of this to be smoothed.
 PADDING_MULTIPLE = 512
@@ -131,7 +127,7 @@ def run_slam(
     notes: tuple[str, ...] = ()
     guessed = arguments.as_guessed(odometry_guessed, len(increments))
     if match_scans and config.scan_matching.use_odometry:
-        increments, is_share, notes = _repaired(increments, scans)
+        increments, is_share, notes = odometry_notes.share_out(increments, scans)
         guessed |= is_share
     elif match_scans:
         increments = np.zeros_like(increments)
@@ -170,9 +166,9 @@ def run_slam(
             keyframe_poses, matched.is_keyframe, motion, matched.increments
         )
     topological_map = online.topological_map(config, state, keyframe_poses)
-    if match_scans and config.scan_matching.use_odometry:
-        notes += _contradictions(np.asarray(matched.matches.odometry_weight))
-        notes += _wrong_scale(matched)
+    if matched.matches is not None and config.scan_matching.use_odometry:
+        notes += odometry_notes.contradictions(matched.matches)
+        notes += odometry_notes.wrong_scale(matched.matches, matched.odometry)
     return SlamResult(
         poses,
         online_poses,
@@ -186,35 +182,6 @@ def run_slam(
         keyframe_odometry,
         notes,
     )
-
-
-def _repaired(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Odometry (T, 3) whose leaps are shared out, its shares (T,), and a note if there are any."""
-    odometry, is_share, num_leaps = share_out_leaps(odometry, scans)
-    note = f"{num_leaps} leaps after latched poses shared out over the scans before"
-    return odometry, is_share, (note,) if num_leaps else ()
-
-
-def _contradictions(odometry_weight: np.ndarray) -> tuple[str, ...]:
-    """A note if scans contradict the odometry, of weights (T,), more than now and then."""
-    contradicted = int(np.sum(odometry_weight < 0.5))
-    if contradicted < MIN_CONTRADICTED * len(odometry_weight):
-        return ()
-    note = f"contradicted by scan matching at {contradicted} of {len(odometry_weight)} scans"
-    return (f"{note}, where it is not used",)
-
-
-def _wrong_scale(matched: MatchedScans) -> tuple[str, ...]:
-    """A note if scans show that the wheels report distances clearly too long or too short."""
-    late = slice(len(matched.odometry) // 2, None)  # when it has been learned
-    used = np.asarray(matched.matches.odometry_weight)[late] > 0.99
-    wheels = matched.odometry[late, 0][used]
-    learned = np.asarray(matched.matches.expected, float)[late, 0][used]
-    scale = np.sum(wheels * learned) / max(np.sum(wheels**2), 1e-12) if used.any() else 1.0
-    if abs(scale - 1.0) < MIN_WRONG_SCALE or not np.any(wheels):
-        return ()
-    percent, what = 100.0 * abs(1.0 / scale - 1.0), "long" if scale < 1.0 else "short"
-    return (f"wheels report distances {percent:.0f} % too {what}, corrected by scan matching",)
 
 
 def smooth_result(

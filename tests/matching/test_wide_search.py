@@ -219,3 +219,43 @@ def test_contradicted_are_points_in_space_that_keyframes_saw_to_be_free(drive):
         LIDAR, surfaces, poses, jnp.asarray(points), jnp.arange(len(points)) % 3 != 0
     )
     assert ahead < 0.02
+
+
+def test_the_scale_of_the_wheels_is_learned_where_scans_show_the_motion_ahead():
+    """Against least squares with the same weights, whose prior is at 1."""
+    rng, history = np.random.default_rng(0), motion_prior.first_history()
+    information = np.diag([4e3, 5e3, 2e4]) + np.outer([30.0, -20.0, 60.0], [30.0, -20.0, 60.0])
+    total, right = motion_prior.SCALE_STD**-2, motion_prior.SCALE_STD**-2
+    step = jax.jit(motion_prior.learn_scale)
+    for _ in range(200):
+        said = jnp.array([rng.uniform(0.1, 0.8), 0.0, rng.normal() * 0.1])
+        moved = jnp.array([0.95 * said[0] + rng.normal() * 0.02, 0.0, said[2]])
+        wheels = motion_prior.wheel_motion(SPEC, history, said, jnp.array(False))
+        history = step(history, wheels, moved, jnp.asarray(information), jnp.array(True))
+        own = information.copy()
+        own[1:, 1:] += np.diag(1.0 / np.asarray(wheels.variance)[1:])
+        ahead = 1.0 / np.linalg.inv(own)[0, 0]
+        ahead -= motion_prior.SURFACE_TILT_STD**2 * (information[0, 0] + information[1, 1])
+        weight = 1.0 / (1.0 / ahead + float(wheels.variance[0]))
+        total, right = total + weight * said[0] ** 2, right + weight * said[0] * moved[0]
+    np.testing.assert_allclose(history.wheel_scale, right / total, rtol=1e-3)
+    assert abs(history.wheel_scale - 0.95) < 0.02
+    corrected = motion_prior.wheel_motion(
+        SPEC, history, jnp.array([1.0, 0.1, 0.2]), jnp.array(False)
+    )
+    expected = np.array([1.0, 0.1, 0.2]) * [history.wheel_scale, history.wheel_scale, 1.0]
+    np.testing.assert_allclose(corrected.increment, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("case", ["corridor", "not used"])
+def test_a_corridor_and_wheels_that_are_wrong_teach_no_scale(case):
+    history, said = motion_prior.first_history(), jnp.array([0.5, 0.0, 0.0])
+    wheels = motion_prior.wheel_motion(SPEC, history, said, jnp.array(False))
+    tilt = 0.05
+    along = np.array([np.sin(tilt), np.cos(tilt), 0.3])  # a wall whose normals are off
+    information = jnp.asarray(1e4 * np.outer(along, along) + np.diag([0.0, 0.0, 1e4]))
+    if case == "not used":
+        information = 1e4 * jnp.eye(3)
+    used = jnp.array(case == "corridor")
+    found = motion_prior.learn_scale(history, wheels, said * 0.9, information, used)
+    assert found.wheel_scale == 1.0 and found.scale_information == history.scale_information

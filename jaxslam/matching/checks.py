@@ -61,14 +61,21 @@ def check_scan_match_spec(spec: ScanMatchSpec, name: str = "spec") -> None:
         ValueError: One is out of range, or there is no gate.
     """
     check_static(name, spec, ScanMatchSpec)
-    for field in ("window_scans", "max_beams", "coarse_scans", "coarse_stride"):
+    for field in ("window_scans", "max_beams", "track_scans", "coarse_stride"):
         check_at_least(f"{name}.{field}", getattr(spec, field), 1)
     for field in ("beam_window", "inner_iterations"):
         check_at_least(f"{name}.{field}", getattr(spec, field), 0)
-    for field in ("coarse_gates", "fine_gates"):
+    for field in ("track_gates", "coarse_gates", "fine_gates"):
         if len(getattr(spec, field)) == 0:
             raise ValueError(f"{name}.{field} is empty; it takes one number or more")
     check_positive(f"{name}.point_std", spec.point_std)
+    if len(spec.track_kernels) != len(spec.track_gates):
+        raise ValueError(
+            f"{name}.track_kernels has {len(spec.track_kernels)} numbers and {name}.track_gates "
+            f"{len(spec.track_gates)}; one for each is expected"
+        )
+    for scale in spec.track_kernels:
+        check_positive(f"{name}.track_kernels", scale)
     for scale in spec.kernel_scales:
         check_positive(f"{name}.kernel_scales", scale)
 

@@ -42,14 +42,15 @@ class ScanMatchSpec(NamedTuple):
     Attributes:
         window_scans: K, keyframes of the submap.
         keyframe_distance: [m], [rad] motion since the last keyframe from which a scan becomes the
-            next one.
+            next one, and is matched with all of the submap.
         max_beams: Points of a scan that are matched at most, evenly spaced.
         beam_window: Beams on either side of a point's own beam that are searched for its
             correspondence.
-        coarse_scans: Keyframes that the coarse search matches against.
-        coarse_stride: Every how many points the coarse search uses one.
-        coarse_gates: [m] largest distance of a correspondence, iteration by iteration, in the
-            coarse search.
+        track_scans: Keyframes, the last ones, that every scan is tracked with.
+        track_gates: [m] largest distance of a correspondence, iteration by iteration, in tracking.
+        track_kernels: [m] residual at which the weight is one quarter, iteration by iteration.
+        coarse_stride: Every how many points the coarse search for a loop closure uses one.
+        coarse_gates: [m] largest distance of a correspondence in it, iteration by iteration.
         fine_gates: [m] the same in the refinement.
         kernel_scales: [m] residual at which the weight is one quarter, in coarse search and
             refinement.
@@ -68,10 +69,12 @@ class ScanMatchSpec(NamedTuple):
     """
 
     window_scans: int = 25
-    keyframe_distance: tuple[float, float] = (0.1, 0.1)
+    keyframe_distance: tuple[float, float] = (0.3, 0.3)
     max_beams: int = 180
     beam_window: int = 3
-    coarse_scans: int = 6
+    track_scans: int = 6
+    track_gates: tuple[float, ...] = (0.8, 0.6, 0.4, 0.25, 0.15)
+    track_kernels: tuple[float, ...] = (0.1, 0.1, 0.1, 0.07, 0.05)
     coarse_stride: int = 4
     coarse_gates: tuple[float, ...] = (0.8, 0.7, 0.6, 0.5, 0.4)
     fine_gates: tuple[float, ...] = (0.4, 0.25, 0.15)
@@ -176,7 +179,7 @@ def icp(
     hit: Array,
     *,
     gates: tuple[float, ...],
-    kernel_scale: float,
+    kernels: tuple[float, ...],
 ) -> MatchedPose:
     """Point-to-line ICP of one scan against a submap; the module's docstring has the formulas.
 
@@ -193,7 +196,7 @@ def icp(
         points: (N, 2) [m] of the scan, robot frame.
         hit: (N,) bool, those of them that exist.
         gates: [m] largest distance of a correspondence, iteration by iteration; static.
-        kernel_scale: [m] scale of the Geman-McClure kernel.
+        kernels: [m] scale of the Geman-McClure kernel, iteration by iteration; static.
 
     Returns:
         The pose, its heading not wrapped; in the inlier fraction a residual e counts
@@ -203,23 +206,26 @@ def icp(
     def correspondences(pose: Array, gate: Array) -> _Correspondences:
         return _correspondences(spec, lidar, submap, transform(pose, points), hit, gate)
 
-    def gauss_newton(pairs: _Correspondences, pose: Array, _: None) -> tuple[Array, None]:
-        information, descent = _normal_equations(spec, kernel_scale, pairs, pose, points)
+    def gauss_newton(
+        pairs: _Correspondences, kernel: Array, pose: Array, _: None
+    ) -> tuple[Array, None]:
+        information, descent = _normal_equations(spec, kernel, pairs, pose, points)
         offset = prior.pose - pose
         descent = descent + prior.information @ offset.at[2].set(wrap_angle(offset[2]))
         root = inverse_cholesky(information + prior.information)[0]
         return pose + root.T @ (root @ descent), None
 
-    def iterate(pose: Array, gate: Array) -> tuple[Array, None]:
-        step = partial(gauss_newton, correspondences(pose, gate))
+    def iterate(pose: Array, scales: tuple[Array, Array]) -> tuple[Array, None]:
+        gate, kernel = scales
+        step = partial(gauss_newton, correspondences(pose, gate), kernel)
         return lax.scan(step, pose, length=spec.inner_iterations)
 
-    pose, _ = lax.scan(iterate, start, jnp.array(gates))
-    pairs = correspondences(pose, jnp.asarray(gates[-1]))
-    information, _ = _normal_equations(spec, kernel_scale, pairs, pose, points)
+    pose, _ = lax.scan(iterate, start, (jnp.array(gates), jnp.array(kernels)))
+    pairs, kernel = correspondences(pose, jnp.asarray(gates[-1])), jnp.asarray(kernels[-1])
+    information, _ = _normal_equations(spec, kernel, pairs, pose, points)
     registered = transform(pose, points)
     error = jnp.sum(pairs.normal * registered[None], axis=-1) - pairs.offset
-    inlier = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel_scale) ** 2) / 8), 0.0)
+    inlier = jnp.where(pairs.share > 0.0, jnp.exp(-((error / kernel) ** 2) / 8), 0.0)
     count = jnp.maximum(jnp.sum(hit, dtype=pose.dtype), 1.0)
     return MatchedPose(pose, information, jnp.sum(jnp.max(inlier, axis=0)) / count)
 
@@ -235,7 +241,8 @@ def fine_icp(
 ) -> MatchedPose:
     """ICP with close correspondences; arguments as of `icp`."""
     gates, scale = spec.fine_gates, spec.kernel_scales[1]
-    return icp(spec, lidar, submap, prior, start, points, hit, gates=gates, kernel_scale=scale)
+    kernels = (scale,) * len(gates)
+    return icp(spec, lidar, submap, prior, start, points, hit, gates=gates, kernels=kernels)
 
 
 def _correspondences(
@@ -283,13 +290,13 @@ def _correspondences(
 
 
 def _normal_equations(
-    spec: ScanMatchSpec, kernel_scale: float, pairs: _Correspondences, pose: Array, points: Array
+    spec: ScanMatchSpec, kernel: Array, pairs: _Correspondences, pose: Array, points: Array
 ) -> tuple[Array, Array]:
     """H (3, 3) and -sum w J^T e / point_std^2 (3,) at a pose (3,), points (N, 2) in robot frame."""
     x, y = (points @ rotation(pose[2]).T).T
     normal_x, normal_y = pairs.normal[..., 0], pairs.normal[..., 1]
     error = normal_x * (x + pose[0])[None] + normal_y * (y + pose[1])[None] - pairs.offset
-    weight = pairs.share / (1.0 + (error / kernel_scale) ** 2) ** 2
+    weight = pairs.share / (1.0 + (error / kernel) ** 2) ** 2
     by_heading = normal_y * x[None] - normal_x * y[None]
     jacobian = normal_x, normal_y, by_heading
 

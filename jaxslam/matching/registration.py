@@ -170,7 +170,7 @@ def register_scan(
             points[thinned],
             hit[thinned],
             gates=scan_matching.coarse_gates,
-            kernel_scale=scan_matching.kernel_scales[0],
+            kernels=(scan_matching.kernel_scales[0],) * len(scan_matching.coarse_gates),
         )
 
     sides = jnp.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)

@@ -2,7 +2,8 @@
 
 The submap holds the points of the last keyframe scans, with the normals of the surfaces they are
 on. A scan is registered where its points are on these surfaces, by ICP from the pose that is
-expected. That is also a weak prior, which keeps directions that the scans do not constrain, such as
+expected: with the last few keyframes, and if it becomes a keyframe itself, with all. The pose that
+is expected is also a weak prior, which keeps directions that the scans do not constrain, such as
 along a bare corridor.
 
 Wheels may be wrong by far more than ICP reaches: they slip, hang, or repeat old values. Where this
@@ -31,7 +32,7 @@ from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
 from jaxslam.core.types import AnyArray, Array, as_bool
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
-from jaxslam.matching.icp import PosePrior, ScanMatchSpec, Submap, fine_icp, icp
+from jaxslam.matching.icp import MatchedPose, PosePrior, ScanMatchSpec, Submap, fine_icp, icp
 from jaxslam.matching.motion_prior import (
     GUESSED_OUTLIER,
     change_variance,
@@ -78,8 +79,10 @@ def match_scan(
 
         1. Predict the pose by odometry, as far as it is trusted; its std grows with the motion, by
            `spec.odometry_slip`.
-        2. Coarse: ICP of few points to recent keyframes, with far correspondences.
-        3. Fine: ICP of all points to all keyframes, with close ones.
+        2. Track: ICP of all points to recent keyframes, from far correspondences to close
+           ones.
+        3. If it has moved enough to become a keyframe: ICP of all points to all keyframes, with
+           close correspondences.
         4. If this explains little, contradicts the wheels, or these are not to be trusted, search a
            wide window as well. Under `jax.vmap` that is computed for every scan, needed or not.
         5. If the result is not finite, the predicted pose and no information.
@@ -164,8 +167,13 @@ def _match_scan(
     information = turn @ jnp.diag(motion.information) @ turn.T
     prior = PosePrior(compose(before, motion.increment), information)
 
-    start = _coarse_pose(spec, lidar, submap, prior, points, hit)
-    quick = fine_icp(spec, lidar, submap, prior, start, points, hit)
+    tracked = _track(spec, lidar, submap, prior, points, hit)
+    is_keyframe = _has_moved(spec, submap, tracked.pose)
+    quick = lax.cond(
+        is_keyframe,
+        lambda: fine_icp(spec, lidar, submap, prior, tracked.pose, points, hit),
+        lambda: tracked,
+    )
     explains_little = quick.inlier_fraction < history.usual_inliers - spec.max_inlier_drop
     odd = explains_little | guessed | need_a_look(spec, history, wheels)
     odd |= contradicts(wheels, relative(before, quick.pose))
@@ -205,38 +213,41 @@ def _match_scan(
     return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), result
 
 
-def _coarse_pose(
+def _track(
     spec: ScanMatchSpec, lidar: Lidar, submap: Submap, prior: PosePrior, points: Array, hit: Array
-) -> Array:
-    """Pose (3,) that the coarse ICP of `match_scan` ends at."""
-    age = jnp.arange(min(spec.coarse_scans, spec.window_scans), dtype=jnp.int32)
+) -> MatchedPose:
+    """Where the scan is by the last `spec.track_scans` keyframes alone."""
+    age = jnp.arange(min(spec.track_scans, spec.window_scans), dtype=jnp.int32)
     recent_slots = (submap.num_added - 1 - age) % spec.window_scans
     surfaces, poses = jax.tree.map(
         lambda x: x[recent_slots], (submap.oriented_points, submap.poses)
     )
-    thinned = slice(None, None, spec.coarse_stride)
     return icp(
         spec,
         lidar,
         submap._replace(oriented_points=surfaces, poses=poses),
         prior,
         prior.pose,
-        points[thinned],
-        hit[thinned],
-        gates=spec.coarse_gates,
-        kernel_scale=spec.kernel_scales[0],
-    ).pose
+        points,
+        hit,
+        gates=spec.track_gates,
+        kernels=spec.track_kernels,
+    )
+
+
+def _has_moved(spec: ScanMatchSpec, submap: Submap, pose: Array) -> Array:
+    """Whether a scan at a pose is far enough from the last keyframe to become one; () bool."""
+    moved = relative(submap.poses[(submap.num_added - 1) % spec.window_scans], pose)
+    far = jnp.hypot(moved[0], moved[1]) > spec.keyframe_distance[0]
+    return far | (jnp.abs(moved[2]) > spec.keyframe_distance[1]) | (submap.num_added == 0)
 
 
 def _add_keyframe(
     spec: ScanMatchSpec, lidar: Lidar, submap: Submap, scan: Scan, pose: Array
 ) -> Submap:
     """The submap after a scan at a pose, which becomes a keyframe if it has moved enough."""
-    size = spec.window_scans
-    moved = relative(submap.poses[(submap.num_added - 1) % size], pose)
-    far = jnp.hypot(moved[0], moved[1]) > spec.keyframe_distance[0]
-    new = far | (jnp.abs(moved[2]) > spec.keyframe_distance[1]) | (submap.num_added == 0)
-    slot = jnp.where(new, submap.num_added % size, size)
+    new = _has_moved(spec, submap, pose)
+    slot = jnp.where(new, submap.num_added % spec.window_scans, spec.window_scans)
     keyframe = transform_points(pose, oriented_points(lidar, scan))
 
     def put(held: Array, item: Array) -> Array:

@@ -92,8 +92,8 @@ def run_slam(
 
     Every scan is matched, in order; front end, filter and smoother work on keyframes, which are
     chosen by the matched motion (`config.keyframe_distance`), and the poses of the scans between
-    them follow from their own matched motion (`keyframes`). Without scan matching every scan is a
-    keyframe.
+    them follow from their own matched motion (`keyframes`). Every scan is a keyframe without scan
+    matching, and where by the odometry more than half of them would be.
 
     The filter estimates each pose from the measurements up to it. With `smooth`, all poses and
     landmarks are estimated from all measurements (`sparse.smooth_log`), and where scans are
@@ -128,6 +128,8 @@ def run_slam(
         increments, notes = _repaired(increments, scans)
     elif match_scans:
         increments = np.zeros_like(increments)
+    distance = keyframes.distance_for_log(config.keyframe_distance, increments)
+    config = config._replace(keyframe_distance=distance)
     state, parts = online.init(config, pose, match_scans=match_scans), []
     log = stages.keyframe_chunks(config, state.submap, increments, scans)
     odometry_parts, matched_parts = [], []

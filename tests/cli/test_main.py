@@ -177,7 +177,7 @@ def test_run_writes_its_files_and_nothing_else(done):
     check_pictures(done.recorded)
     assert (done.recorded / "scan.png").read_bytes().startswith(b"\x89PNG")
     with Image.open(done.recorded / "run.gif") as animation:
-        assert animation.n_frames == load(done.recorded)["keyframes"] == SCANS
+        assert animation.n_frames == load(done.recorded)["keyframes"] < SCANS
 
 
 @pytest.mark.slow

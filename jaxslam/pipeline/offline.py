@@ -111,7 +111,8 @@ def run_slam(
         start: (3,) [m, m, rad] first pose, map frame; zero by default.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
-        callback: Called after each chunk of keyframes with the state and the result of the chunk.
+        callback: Called after each chunk of keyframes with the state and the result of the chunk;
+            the submap of the state may already hold later scans.
 
     Raises:
         ValueError: An argument has another shape, or does not fit the others; the odometry holds

@@ -33,7 +33,7 @@ class Config(NamedTuple):
         loop_closure: Loop closures, for batch smoothing.
         keyframe_distance: [m], [rad] matched motion since the last keyframe that makes a scan of a
             log a keyframe, if it exceeds one of both; other scans are only matched. None: every
-            scan is a keyframe.
+            scan is a keyframe, as where more than half of them would be.
     """
 
     frontend: FrontendConfig = FRONTEND

@@ -1,8 +1,9 @@
 """Keyframes: scans that are chosen by motion; those between them are only matched.
 
 A scan becomes a keyframe where the matched motion since the last keyframe exceeds a distance or an
-angle. Of the scans i + 1 .. j from one keyframe to the next, the filter gets one increment by the
-wheels and one by scan matching, each the composition of theirs:
+angle; of logs whose scans are that far apart, all are. Of the scans i + 1 .. j from one keyframe
+to the next, the filter gets one increment by the wheels and one by scan matching, each the
+composition of theirs:
 
     u = u_(i+1) (+) ... (+) u_j
 
@@ -39,6 +40,9 @@ from jaxslam.core.types import AnyArray
 NO_INFORMATION = 1.0
 """[1/m^2], [1/rad^2] information that is little: a metre and a radian."""
 
+MAX_FRACTION = 0.5
+"""Fraction of the scans above which choosing keyframes saves little, and all scans are kept."""
+
 AT_REST = (0.0, 0.0, 0.0)
 
 
@@ -56,6 +60,22 @@ def check_distance(distance: Any) -> None:
             f"config.keyframe_distance is {distance}, not a tuple of two positive numbers, "
             "[m] and [rad], or None"
         )
+
+
+def distance_for_log(
+    distance: tuple[float, float] | None, odometry: np.ndarray
+) -> tuple[float, float] | None:
+    """The distance of keyframes for a log; None, every scan, where it has hardly more scans.
+
+    Many logs were thinned when they were recorded. To leave out a few of their scans saves nothing,
+    and costs what these would show of the landmarks.
+
+    Args:
+        distance: [m], [rad] as of `choose_keyframes`.
+        odometry: (T, 3) [m, m, rad] increments by the wheels; all zero where there are none.
+    """
+    is_keyframe, _ = choose_keyframes(distance, odometry)
+    return distance if np.mean(is_keyframe) <= MAX_FRACTION else None
 
 
 def choose_keyframes(

@@ -91,8 +91,8 @@ def run_slam(
 
     Every scan is matched, in order; front end, filter and smoother work on keyframes, which are
     chosen by the matched motion (`config.keyframe_distance`), and the poses of the scans between
-    them follow from their own matched motion (`keyframes`). Without scan matching every scan is a
-    keyframe.
+    them follow from their own matched motion (`keyframes`). Every scan is a keyframe without scan
+    matching, and where by the odometry more than half of them would be.
 
     The filter estimates each pose from the measurements up to it. With `smooth`, all poses and
     landmarks are estimated from all measurements (`sparse.smooth_log`), and where scans are
@@ -112,7 +112,8 @@ def run_slam(
             the log, not what the wheels said (`LaserLog.odometry_guessed`); none by default.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
-        callback: Called after each chunk of keyframes with the state and the result of the chunk.
+        callback: Called after each chunk of keyframes with the state and the result of the chunk;
+            the submap of the state may already hold later scans.
 
     Raises:
         ValueError: An argument has another shape, or does not fit the others; the odometry holds
@@ -131,6 +132,8 @@ def run_slam(
         guessed |= is_share
     elif match_scans:
         increments = np.zeros_like(increments)
+    distance = keyframes.distance_for_log(config.keyframe_distance, increments)
+    config = config._replace(keyframe_distance=distance)
     state, parts = online.init(config, pose, match_scans=match_scans), []
     log = stages.keyframe_chunks(config, state.submap, increments, scans, guessed)
     odometry_parts, matched_parts = [], []

@@ -64,6 +64,16 @@ def test_without_a_distance_every_scan_is_a_keyframe():
     assert keyframes.choose_keyframes(None, INCREMENTS)[0].all()
 
 
+@pytest.mark.parametrize("step, kept", [(0.06, DISTANCE), (0.16, DISTANCE), (0.31, None)])
+def test_a_log_of_keyframes_is_taken_whole(step, kept):
+    """Steps of 0.16 m make every second scan a keyframe; those of 0.31 m every scan."""
+    odometry = np.tile([step, 0.0, 0.0], (100, 1))
+    odometry[0] = 0.0
+    assert keyframes.distance_for_log(DISTANCE, odometry) == kept
+    assert keyframes.distance_for_log(None, odometry) is None
+    assert keyframes.distance_for_log(DISTANCE, 0.0 * odometry) == DISTANCE  # without odometry
+
+
 def test_motion_is_that_of_dead_reckoning_from_the_keyframe_before():
     poses = dead_reckoning(HERE, INCREMENTS)
     motion = keyframes.motion_since_keyframe(INCREMENTS, CHOSEN)

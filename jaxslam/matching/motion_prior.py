@@ -235,7 +235,9 @@ def learn_scale(
 
     The distance ahead by the scan is m = s d + noise, with d that of the wheels and a variance that
     is the sum of theirs and of the scan's; the last is what is left of the information when
-    sideways motion and turn are not known, less what tilted normals pretend.
+    sideways motion and turn are not known, less what tilted normals pretend. As d has noise, too,
+    least squares would make s too small where motions are short. So s is estimated with an
+    instrument z, the distance of the scan before with the sign of d: sum z (m - s d) / var = 0.
 
     Args:
         history: Before.
@@ -252,8 +254,9 @@ def learn_scale(
     ahead = jnp.maximum(information[0, 0] - explained - pretended, 0.0)
     ahead = ahead / (1.0 + ahead * wheels.variance[0])
     distance = wheels.increment[0] / history.wheel_scale
-    gained = jnp.where(use, ahead * distance**2, 0.0)
-    off = ahead * distance * (increment[0] - wheels.increment[0])
+    instrument = jnp.sign(distance) * jnp.abs(history.increment[0])
+    gained = jnp.where(use, ahead * instrument * distance, 0.0)
+    off = ahead * instrument * (increment[0] - wheels.increment[0])
     total = history.scale_information + gained
     return history._replace(
         wheel_scale=history.wheel_scale + jnp.where(use, off, 0.0) / total, scale_information=total

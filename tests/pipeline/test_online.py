@@ -296,7 +296,7 @@ def test_without_scan_matching_every_scan_is_a_keyframe(drive, results, monkeypa
 def test_nothing_is_matched_any_more_after_a_run_that_fails(drive, monkeypatch):
     matched = []
 
-    def match(config, submap, odometry, scans):
+    def match(config, submap, odometry, scans, guessed):
         matched.append(len(odometry))
         time.sleep(0.05)
         return submap, scan_matches

@@ -14,6 +14,7 @@ from jaxslam.frontend.automaton import Diagram
 from jaxslam.frontend.config import FrontendConfig, check_config
 from jaxslam.frontend.features import find_corners, find_wall_directions
 from jaxslam.frontend.grid import rasterise, seen_free
+from jaxslam.frontend.lidar import begin_behind
 from jaxslam.frontend.local_graph import LocalArcs
 from jaxslam.frontend.segments import segment_cells
 
@@ -68,8 +69,8 @@ def extract_diagram(config: FrontendConfig, scan: Scan) -> tuple[Features, Diagr
         Paper, section 2; `labels="codes"` is its method, with fronts that are diamonds.
     """
     check_config(config)
-    scan = as_scan(config.lidar, scan)
-    lidar, spec = config.lidar, config.grid
+    lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
+    spec = config.grid
     segments = segmentation.find_segments(lidar, config.segments, scan)
     if config.labels == "codes":
         grid = rasterise(lidar, spec, scan)
@@ -105,9 +106,9 @@ def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, L
         ValueError: As of `extract_features`, or there may be more than 31 junctions.
     """
     features, diagram, sources = extract_diagram(config, scan)
-    scan = as_scan(config.lidar, scan)
+    lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
     arcs = local_graph.find_local_arcs(
-        config.lidar, config.grid, config.features, features, diagram, sources, scan
+        lidar, config.grid, config.features, features, diagram, sources, scan
     )
     return features, arcs
 

@@ -1,5 +1,7 @@
 """Geometry of a laser scan: directions and end points of the beams, what they see to be free."""
 
+import math
+
 import jax.numpy as jnp
 
 from jaxslam.core.scan import Lidar, Scan, check_lidar
@@ -44,6 +46,25 @@ def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
     low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.num_beams - 2)
     within = (beam > -0.5) & (beam < lidar.num_beams - 0.5)
     return within & (jnp.linalg.norm(points, axis=-1) < jnp.minimum(ranges[low], ranges[low + 1]))
+
+
+def begin_behind(lidar: Lidar, scan: Scan) -> tuple[Lidar, Scan]:
+    """The scanner and a scan with beam 0 behind the robot, if the beams go all around it.
+
+    Where the first beam is, walls end: so results would depend on it. Other scanners and their
+    scans are returned as they are.
+
+    Args:
+        lidar: The scanner.
+        scan: One of its scans.
+    """
+    beams_around = 2.0 * math.pi / lidar.angle_increment
+    if abs(lidar.num_beams - beams_around) > 0.5:
+        return lidar, scan
+    first = math.ceil((-math.pi - lidar.angle_min) / lidar.angle_increment - 1e-6)
+    angle_min = lidar.angle_min + first * lidar.angle_increment
+    rolled = Scan._make(jnp.roll(x, -first) for x in scan)
+    return lidar._replace(angle_min=angle_min), rolled
 
 
 def to_scan(lidar: Lidar, ranges: Array) -> Scan:

@@ -101,13 +101,19 @@ def likelihood_field(spec: CorrelativeSpec, points: Array, valid: Array) -> Arra
 
 
 def window_scores(
-    spec: CorrelativeSpec, field: Array, points: Array, hit: Array, every_heading: Array
+    spec: CorrelativeSpec,
+    field: Array,
+    log_density: Callable[[Array], Array],
+    points: Array,
+    hit: Array,
+    every_heading: Array,
 ) -> Array:
     """Scores (A, S, S) of all headings of a whole turn and all displacements of the window.
 
     Args:
         spec: Options.
         field: (G, G) likelihood field in the frame of the guess.
+        log_density: Of a pose (3,) in that frame, as of `search`.
         points: (P, 2) [m] of the scan, robot frame.
         hit: (P,) bool, those of them that exist.
         every_heading: () bool; if not, headings further than `spec.max_turn` from the guess's are
@@ -116,7 +122,8 @@ def window_scores(
     half, steps = _half_size(spec), _steps(spec.max_displacement, spec.cell)
     size = 2 * steps + 1
     padded = jnp.pad(field, steps)  # the window of cell (i, j) begins at (i, j)
-    all_headings = headings(spec, field.dtype)
+    all_headings, offset = headings(spec, field.dtype), displacements(spec, field.dtype)
+    shifts = jnp.stack(jnp.meshgrid(offset, offset, indexing="ij"), axis=-1).reshape(-1, 2)
     middle = len(all_headings) // 2
     some = min(_steps(spec.max_turn, spec.turn_step), middle)
     reach = jnp.where(every_heading, jnp.int32(middle), jnp.int32(some))
@@ -132,7 +139,11 @@ def window_scores(
             return total + jnp.where(counts, window, 0.0), None
 
         total, _ = lax.scan(add, jnp.zeros((size, size), field.dtype), (cell, inside))
-        return scores.at[k].set(total / jnp.maximum(jnp.sum(hit, dtype=field.dtype), 1.0))
+        turn = jnp.full((len(shifts), 1), all_headings[k])
+        poses = jnp.concatenate([shifts, turn], axis=1)
+        unlikely = surprise(spec, jax.vmap(log_density)(poses)).reshape(size, size)
+        count = jnp.maximum(jnp.sum(hit, dtype=field.dtype), 1.0)
+        return scores.at[k].set(total / count - unlikely)
 
     scores = jnp.full((len(all_headings), size, size), -jnp.inf, field.dtype)
     return lax.fori_loop(
@@ -173,29 +184,29 @@ def search(
     """
     every = -(-len(points) // spec.max_points)
     field = likelihood_field(spec, (submap - guess[None, :2]) @ rotation(guess[2]), valid)
-    score = window_scores(spec, field, points[::every], hit[::every], every_heading)
-    offset = spec.cell * jnp.arange(-(score.shape[1] // 2), score.shape[1] // 2 + 1.0)
-    turn = headings(spec, field.dtype)
 
-    def unlikely(pose: Array) -> Array:
-        return surprise(spec, log_density(compose(guess, pose)))
+    def density_from_guess(pose: Array) -> Array:
+        return log_density(compose(guess, pose))
 
-    def pose_at(k: Array, i: Array, j: Array) -> Array:
-        return jnp.stack([offset[i], offset[j], turn[k]])
-
-    index = jnp.stack(jnp.meshgrid(*map(jnp.arange, score.shape), indexing="ij"), axis=-1)
-    penalty = jax.vmap(lambda at: unlikely(pose_at(*at)))(index.reshape(-1, 3))
-    score = score - penalty.reshape(score.shape)
+    thinned = points[::every], hit[::every]
+    score = window_scores(spec, field, density_from_guess, *thinned, every_heading)
+    offset, turn = displacements(spec, field.dtype), headings(spec, field.dtype)
 
     def take(left: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         k, i, j = jnp.unravel_index(jnp.argmax(left), left.shape)
         near = jnp.hypot(offset[:, None] - offset[i], offset[None] - offset[j]) < spec.distinct[0]
         turned = jnp.abs(wrap_angle(turn - turn[k])) < spec.distinct[1]
         left = jnp.where(turned[:, None, None] & near[None], -jnp.inf, left)
-        return left, (pose_at(k, i, j), score[k, i, j])
+        return left, (jnp.stack([offset[i], offset[j], turn[k]]), score[k, i, j])
 
     _, (found, value) = lax.scan(take, score, length=spec.num_candidates)
     return Candidates(jax.vmap(compose, in_axes=(None, 0))(guess, found), value)
+
+
+def displacements(spec: CorrelativeSpec, dtype: np.dtype) -> Array:
+    """Displacements (S,) [m] of the window along an axis, ascending."""
+    steps = _steps(spec.max_displacement, spec.cell)
+    return spec.cell * jnp.arange(-steps, steps + 1, dtype=dtype)
 
 
 def headings(spec: CorrelativeSpec, dtype: np.dtype) -> Array:

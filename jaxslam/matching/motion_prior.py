@@ -55,6 +55,9 @@ SURFACE_TILT_STD = 0.1
 LEAST_CHANGE = (0.02, 0.02)
 """[m], [rad] by which a motion may always change: errors of two matches."""
 
+ICP_REACH = (0.2, 0.2)
+"""[m], [rad] within which ICP finds a pose from another one."""
+
 FIRST_CHANGE = (0.1, 0.1)
 """[m], [rad] usual change before there is any: robots of these logs accelerate by 1 m/s^2."""
 
@@ -200,7 +203,8 @@ def need_a_look(spec: ScanMatchSpec, history: MotionHistory, wheels: WheelMotion
     if not spec.use_odometry:
         return jnp.zeros((), bool)
     change = magnitude(difference(history.increment, wheels.increment))
-    far = change > MAX_STD * (history.usual_change + jnp.array(LEAST_CHANGE))
+    usual = MAX_STD * (history.usual_change + jnp.array(LEAST_CHANGE))
+    far = change > jnp.maximum(usual, jnp.array(ICP_REACH))
     leap = jnp.any(far) & (wheels.outlier_probability < GUESSED_OUTLIER)
     again = (history.contradicted > MIN_CONTRADICTED) & contradicts(wheels, history.increment)
     return leap | again

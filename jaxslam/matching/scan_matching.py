@@ -174,7 +174,9 @@ def _match_scan(
         lambda: fine_icp(spec, lidar, submap, prior, tracked.pose, points, hit),
         lambda: tracked,
     )
-    explains_little = quick.inlier_fraction < history.usual_inliers - spec.max_inlier_drop
+    # Scans that are only tracked may wait for the next keyframe, if they explain something.
+    max_drop = spec.max_inlier_drop * jnp.where(is_keyframe, 1.0, 2.0)
+    explains_little = quick.inlier_fraction < history.usual_inliers - max_drop
     odd = explains_little | guessed | need_a_look(spec, history, wheels)
     odd |= contradicts(wheels, relative(before, quick.pose))
     match = lax.cond(

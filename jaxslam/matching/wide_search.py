@@ -86,7 +86,8 @@ def search_widely(
         prior = PosePrior(start, information)
         return fine_icp(spec, lidar, submap, prior, start, points, hit)
 
-    refined = lax.map(refine, jnp.concatenate([candidates, hypotheses.poses]))
+    # The quick match began where the wheels had it.
+    refined = lax.map(refine, jnp.concatenate([candidates, hypotheses.poses[1:]]))
     found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), quick, refined)
 
     def value(match: MatchedPose) -> Array:

@@ -14,7 +14,7 @@ from jaxslam.frontend.edge_codes import edge_codes
 from jaxslam.frontend.extract import extract_features, extract_local_graph
 from jaxslam.frontend.features import FeatureSpec, features_from_range_bearing
 from jaxslam.frontend.grid import Grid, GridSpec, rasterise
-from jaxslam.frontend.lidar import to_scan
+from jaxslam.frontend.lidar import begin_behind, to_scan
 from jaxslam.frontend.segmentation import find_segments
 from jaxslam.frontend.segments import SegmentSpec
 
@@ -206,3 +206,40 @@ def test_more_junctions_than_bits_are_refused():
         ValueError, match=re.escape("features.max_junctions is 32, more than the 31")
     ):
         jax.eval_shape(lambda: extract_local_graph(many, GOOD))
+
+
+@pytest.mark.parametrize("labels", ["segments", "codes"])
+def test_what_is_found_does_not_depend_on_which_beam_of_a_full_turn_is_the_first(labels):
+    """A room with a doorway and a pillar, seen by scanners whose first beams look elsewhere."""
+    count = 180
+    step = 2 * np.pi / count
+    around = Lidar(num_beams=count, angle_min=-np.pi, angle_increment=step)
+    angles = np.asarray(around.angle_min + step * np.arange(count))
+    walls = np.array(
+        [[-2.0, -1.5, 2.5, -1.5], [2.5, -1.5, 2.5, 1.2], [2.5, 1.2, 0.5, 1.2], [-0.4, 1.2, -2, 1.2]]
+        + [[-2.0, 1.2, -2.0, -1.5], [-1.2, 0.2, -0.9, 0.2], [-0.9, 0.2, -0.9, 0.5]]
+    )
+    direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ranges = np.full(count, 9.0)
+    for x1, y1, x2, y2 in walls:
+        edge = np.array([x2 - x1, y2 - y1])
+        across = direction[:, 0] * edge[1] - direction[:, 1] * edge[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (x1 * edge[1] - y1 * edge[0]) / across
+            at = (x1 * direction[:, 1] - y1 * direction[:, 0]) / across
+        ranges = np.where((along > 0) & (at >= 0) & (at <= 1), np.minimum(ranges, along), ranges)
+    found = []
+    for first in (0, 137):
+        lidar = around._replace(angle_min=-np.pi + first * step)
+        config = FrontendConfig(lidar=lidar, labels=labels)
+        scan = to_scan(lidar, jnp.asarray(np.roll(ranges, -first)))
+        found.append(jax.jit(extract_local_graph, static_argnums=0)(config, scan))
+    assert np.asarray(found[0][0].valid).sum() > 6
+    for other in found[1:]:
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), found[0], other)
+
+
+def test_where_a_scanner_does_not_see_all_around_its_scans_stay_as_they_are():
+    lidar = Lidar(num_beams=61, angle_min=-np.pi / 3, angle_increment=np.pi / 90)
+    scan = to_scan(lidar, jnp.arange(1.0, 62.0) / 10)
+    assert begin_behind(lidar, scan) == (lidar, scan)

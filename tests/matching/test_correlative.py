@@ -73,12 +73,14 @@ def test_scores_are_those_of_brute_force():
     field = jnp.asarray(slow_field(points))
     hit = jnp.arange(41) < 40
     padded = jnp.asarray(np.concatenate([scan, [[0.0, 0.0]]]))
-    found = correlative.window_scores(SPEC, field, padded, hit, jnp.asarray(False))
+    alike = jnp.sum  # of nothing: all poses are as likely
+    no_prior = SPEC._replace(score_scale=0.0)
+    found = correlative.window_scores(no_prior, field, alike, padded, hit, jnp.asarray(False))
     middle = len(found) // 2
     slow = slow_scores(points, scan)
     np.testing.assert_allclose(found[middle - 4 : middle + 5], slow, atol=1e-6)
     assert np.isneginf(found[: middle - 4]).all() and np.isneginf(found[middle + 5 :]).all()
-    whole = correlative.window_scores(SPEC, field, padded, hit, jnp.asarray(True))
+    whole = correlative.window_scores(no_prior, field, alike, padded, hit, jnp.asarray(True))
     assert np.isfinite(whole).all() and len(whole) * SPEC.turn_step > 2 * np.pi - 0.1
     np.testing.assert_allclose(whole[middle - 4 : middle + 5], slow, atol=1e-6)
 

@@ -46,7 +46,7 @@ of the last five."""
 MAX_STD = 3.0
 """Standard deviations beyond which an increment contradicts what was expected."""
 
-SCALE_STD = 0.02
+SCALE_STD = 0.01
 """Standard deviation of the scale of the wheels' distances before any scan."""
 
 SURFACE_TILT_STD = 0.1

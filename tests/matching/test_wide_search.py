@@ -227,7 +227,7 @@ def test_the_scale_of_the_wheels_is_learned_where_scans_show_the_motion_ahead():
     information = np.diag([4e3, 5e3, 2e4]) + np.outer([30.0, -20.0, 60.0], [30.0, -20.0, 60.0])
     total, right = motion_prior.SCALE_STD**-2, motion_prior.SCALE_STD**-2
     step = jax.jit(motion_prior.learn_scale)
-    for _ in range(200):
+    for _ in range(600):
         said = jnp.array([rng.uniform(0.1, 0.8), 0.0, rng.normal() * 0.1])
         moved = jnp.array([0.95 * said[0] + rng.normal() * 0.02, 0.0, said[2]])
         wheels = motion_prior.wheel_motion(SPEC, history, said, jnp.array(False))

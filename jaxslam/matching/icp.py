@@ -30,7 +30,7 @@ from jaxslam.core.scan import Lidar
 from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.matching.correlative import CorrelativeSpec
-from jaxslam.matching.oriented_points import OrientedPoints
+from jaxslam.matching.oriented_points import OrientedPoints, beam_towards
 
 FAR_AWAY = 1e6
 """[m] coordinates of points that must not become correspondences."""
@@ -255,7 +255,6 @@ def _correspondences(
     limits the distances across and along the line; along it, the gap between two beams is allowed
     too.
     """
-    middle = lidar.angle_min + lidar.angle_increment * (lidar.num_beams - 1) / 2
     # Column by column, as pairs of numbers are gathered slowly.
     columns = jnp.where(
         submap.oriented_points.valid[..., None], submap.oriented_points.points, FAR_AWAY
@@ -266,10 +265,7 @@ def _correspondences(
         surface: OrientedPoints, column: Array, pose: Array
     ) -> tuple[Array, Array, Array]:
         (x, y), (surface_x, surface_y) = points.T, column
-        bearing = wrap_angle(jnp.arctan2(y - pose[1], x - pose[0]) - pose[2] - middle)
-        own_beam = jnp.round(bearing / lidar.angle_increment + (lidar.num_beams - 1) / 2).astype(
-            jnp.int32
-        )
+        own_beam = beam_towards(lidar, pose, points)
         least = jnp.full(hit.shape, jnp.inf, points.dtype)  # squared distance
         nearest = jnp.zeros_like(own_beam)
         for k in range(-spec.beam_window, spec.beam_window + 1):

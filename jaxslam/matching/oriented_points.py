@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.se2 import dot, rotation, transform
+from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.frontend.lidar import beam_ends
 
@@ -100,3 +100,18 @@ def transform_points(pose: Array, points: OrientedPoints) -> OrientedPoints:
     """Oriented points of the frame of a pose (3,), in the frame that the pose is given in."""
     turn = rotation(pose[2])
     return points._replace(points=transform(pose, points.points), normal=points.normal @ turn.T)
+
+
+def beam_towards(lidar: Lidar, pose: Array, points: Array) -> Array:
+    """Beam (N,) int32 that looks nearest at each point; beyond 0 .. R - 1 out of the field of view.
+
+    Args:
+        lidar: The scanner.
+        pose: (3,) [m, m, rad] of the scanner.
+        points: (N, 2) [m] in the same frame.
+    """
+    last = lidar.num_beams - 1
+    middle = lidar.angle_min + lidar.angle_increment * last / 2
+    x, y = points.T
+    bearing = wrap_angle(jnp.arctan2(y - pose[1], x - pose[0]) - pose[2] - middle)
+    return jnp.round(bearing / lidar.angle_increment + last / 2).astype(jnp.int32)

@@ -30,7 +30,7 @@ from jaxslam.core.types import Array
 from jaxslam.matching import correlative
 from jaxslam.matching.icp import MatchedPose, PosePrior, ScanMatchSpec, Submap, fine_icp
 from jaxslam.matching.motion_prior import PoseHypotheses, log_density
-from jaxslam.matching.oriented_points import OrientedPoints
+from jaxslam.matching.oriented_points import OrientedPoints, beam_towards
 
 PROBABILITY_SCALE = 0.01
 """Difference of two values that makes one place e times as likely as the other."""
@@ -125,14 +125,13 @@ def contradicted_fraction(
         points: (N, 2) [m].
         hit: (N,) bool, those of them that exist.
     """
-    middle = lidar.angle_min + lidar.angle_increment * (lidar.num_beams - 1) / 2
 
     def in_free_space(surface: OrientedPoints, pose: Array) -> tuple[Array, Array]:
         distance = jnp.linalg.norm(surface.points - pose[None, :2], axis=-1)
         away = points - pose[None, :2]
-        bearing = wrap_angle(jnp.arctan2(away[:, 1], away[:, 0]) - pose[2] - middle)
-        beam = jnp.round(bearing / lidar.angle_increment + (lidar.num_beams - 1) / 2)
-        around = beam.astype(jnp.int32)[:, None] + jnp.arange(-1, 2, dtype=jnp.int32)[None]
+        around = (
+            beam_towards(lidar, pose, points)[:, None] + jnp.arange(-1, 2, dtype=jnp.int32)[None]
+        )
         inside = jnp.all((around >= 0) & (around < lidar.num_beams), axis=-1)
         around = around.clip(0, lidar.num_beams - 1)
         seen = inside & jnp.all(surface.valid[around], axis=-1)

@@ -55,11 +55,12 @@ def scan_times(stamps: Stamps, poses: np.ndarray | None = None) -> tuple[np.ndar
             made faster than `NOMINAL_SPEED` in nearly all steps.
 
     Returns:
-        (T,) float64 [s]: the stamps of the scans if they can be used; and notes if they cannot.
+        (T,) float64 [s]: the stamps of the scans if they can be used, where single ones may run
+        backwards; and notes of what is wrong with them.
     """
     own, notes = _fill_zeros(stamps.own)
     if are_distinct(own) and not is_set_back(own):
-        return own, notes
+        return own, notes + _steps_back(own)
     problem = "time stamps of the scans " + (
         "are set back" if are_distinct(own) else "do not distinguish the scans"
     )
@@ -190,6 +191,13 @@ def _fill_zeros(times: np.ndarray) -> tuple[np.ndarray, list[str]]:
     filled += step * (index - known[-1]).clip(0)
     filled[known] = times[known]
     return filled, [f"{int(missing.sum())} time stamps are 0: they are interpolated in file order"]
+
+
+def _steps_back(times: np.ndarray) -> list[str]:
+    """A note if single times run backwards: they stay, as references name scans by their stamps."""
+    num_steps = int(np.sum(np.diff(times) < 0.0))
+    where = f"time stamps of the scans run backwards at {num_steps} of {len(times)}"
+    return [f"{where}: scans stay in file order, and keep their stamps"] if num_steps else []
 
 
 def _running_median(times: np.ndarray) -> np.ndarray:

@@ -101,6 +101,7 @@ class MotionHistory(NamedTuple):
         usual_inliers: () running mean of the inlier fraction.
         wheel_scale: () true distance per distance that the wheels report, as far as it is learned.
         scale_information: () its inverse variance.
+        wheels_reverse: () bool, whether the wheels ever reported driving backwards.
     """
 
     increment: Array
@@ -109,6 +110,7 @@ class MotionHistory(NamedTuple):
     usual_inliers: Array
     wheel_scale: Array
     scale_information: Array
+    wheels_reverse: Array
 
 
 class Submap(NamedTuple):

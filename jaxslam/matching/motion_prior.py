@@ -5,11 +5,13 @@ slip, hang, or repeat old values. A robot is heavy, so then its motion is about 
 scan before to the last one. With the probability o that the wheels are wrong, the pose of the scan
 has the density
 
-    p(pose) = (1 - o) t(pose; as the wheels say) + o t(pose; as before)
+    p(pose) = (1 - u) ((1 - o) t(pose; as the wheels say) + o t(pose; as before))
+              + u t(pose; as the wheels say, but backwards)
 
-of two Student t distributions, as either is now and then off by several standard deviations. Here o
-is how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, and
-`GUESSED_OUTLIER` where the log itself says that an increment is a guess. The quick match needs one
+of Student t distributions, as each is now and then off by several standard deviations. Here o is
+how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, and `GUESSED_OUTLIER`
+where the log itself says that an increment is a guess. Some robots report the speed without its
+sign; so u is `MIN_OUTLIER` until the wheels first report driving backwards, and then 0. The quick match needs one
 Gaussian near the right place: both are combined by their information, weighted by 1 - o and o.
 
 Wheels may also be wrong by the same factor all the time: a tyre that is worn or soft makes every
@@ -57,6 +59,9 @@ LEAST_CHANGE = (0.02, 0.02)
 
 ICP_REACH = (0.2, 0.2)
 """[m], [rad] within which ICP finds a pose from another one."""
+
+LEAST_REVERSE = -0.002
+"""[m] increment ahead below which the wheels report driving backwards, not a rounding."""
 
 FIRST_CHANGE = (0.1, 0.1)
 """[m], [rad] usual change before there is any: robots of these logs accelerate by 1 m/s^2."""
@@ -116,6 +121,7 @@ def first_history() -> MotionHistory:
         usual_inliers=jnp.ones(()),
         wheel_scale=jnp.ones(()),
         scale_information=jnp.full((), SCALE_STD**-2),
+        wheels_reverse=jnp.zeros((), bool),
     )
 
 
@@ -164,9 +170,13 @@ def pose_hypotheses(history: MotionHistory, wheels: WheelMotion, before: Array) 
         before: (3,) [m, m, rad] pose of the scan before.
     """
     outlier = jnp.maximum(wheels.outlier_probability, MIN_OUTLIER)
-    poses = jnp.stack([compose(before, wheels.increment), compose(before, history.increment)])
-    variances = jnp.stack([wheels.variance, change_variance(history)])
-    return PoseHypotheses(poses, variances, jnp.stack([1.0 - outlier, outlier]), before[2])
+    backwards = wheels.increment.at[0].multiply(-1.0)
+    unsigned = jnp.where(history.wheels_reverse, 0.0, MIN_OUTLIER)
+    increments = [wheels.increment, history.increment, backwards]
+    poses = jnp.stack([compose(before, increment) for increment in increments])
+    variances = jnp.stack([wheels.variance, change_variance(history), wheels.variance])
+    weights = jnp.stack([(1.0 - unsigned) * (1.0 - outlier), (1.0 - unsigned) * outlier, unsigned])
+    return PoseHypotheses(poses, variances, weights, before[2])
 
 
 def log_density(hypotheses: PoseHypotheses, pose: Array) -> Array:
@@ -217,7 +227,11 @@ def contradicts(wheels: WheelMotion, increment: Array) -> Array:
 
 
 def next_history(
-    history: MotionHistory, increment: Array, inlier_fraction: Array, contradicted: Array
+    history: MotionHistory,
+    wheels: WheelMotion,
+    increment: Array,
+    inlier_fraction: Array,
+    contradicted: Array,
 ) -> MotionHistory:
     """The history after a scan, of an increment (3,)."""
     change = magnitude(difference(history.increment, increment))
@@ -229,6 +243,7 @@ def next_history(
         usual_change=MEMORY * history.usual_change + (1.0 - MEMORY) * change,
         contradicted=OUTLIER_MEMORY * history.contradicted + (1.0 - OUTLIER_MEMORY) * contradiction,
         usual_inliers=MEMORY * history.usual_inliers + (1.0 - MEMORY) * inlier_fraction,
+        wheels_reverse=history.wheels_reverse | (wheels.increment[0] < LEAST_REVERSE),
     )
 
 

@@ -175,7 +175,7 @@ def _match_scan(
         lambda: tracked,
     )
     # Scans that are only tracked may wait for the next keyframe, if they explain something.
-    max_drop = spec.max_inlier_drop * jnp.where(is_keyframe, 1.0, 2.0)
+    max_drop = spec.max_inlier_drop * jnp.where(is_keyframe, 1.0, 1.5)
     explains_little = quick.inlier_fraction < history.usual_inliers - max_drop
     odd = explains_little | guessed | need_a_look(spec, history, wheels)
     odd |= contradicts(wheels, relative(before, quick.pose))
@@ -211,7 +211,7 @@ def _match_scan(
     )
     learn = finite & ~contradicted & (wheels.outlier_probability < GUESSED_OUTLIER)
     history = learn_scale(history, wheels, increment, result.information, learn)
-    history = next_history(history, increment, match.inlier_fraction, contradicted)
+    history = next_history(history, wheels, increment, match.inlier_fraction, contradicted)
     return _add_keyframe(spec, lidar, submap._replace(motion=history), scan, pose), result
 
 

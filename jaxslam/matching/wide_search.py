@@ -63,7 +63,7 @@ def search_widely(
         quick: The quick match.
     """
     surfaces = submap.oriented_points
-    first, second = hypotheses.poses
+    first, second = hypotheses.poses[:2]
     turn = wrap_angle(second[2] - first[2])
     middle = jnp.stack(
         [(first[0] + second[0]) / 2, (first[1] + second[1]) / 2, first[2] + turn / 2]

@@ -7,6 +7,8 @@ from jaxslam.core.scan import Scan
 from jaxslam.matching.latched_odometry import share_out_leaps
 
 MIN_WRONG_SCALE = 0.025  # of the wheels' distances, from which it is noted
+MIRRORED = 0.5  # error of a distance, of itself, up to which it is the wheels' but for the sign
+MIN_MIRRORED = 5  # scans from which on such wheels are noted
 MIN_CONTRADICTED = 0.01  # fraction of the scans from which contradictions are noted
 
 
@@ -25,6 +27,22 @@ def contradictions(matches: ScanMatch) -> tuple[str, ...]:
         return ()
     note = f"contradicted by scan matching at {contradicted} of {len(weight)} scans"
     return (f"{note}, where it is not used",)
+
+
+def unsigned(matches: ScanMatch, odometry: np.ndarray) -> tuple[str, ...]:
+    """A note if at most of the scans [T] that contradict the wheels, these have the wrong sign.
+
+    Args:
+        matches: Of all scans.
+        odometry: (T, 3) [m, m, rad] increments by the wheels.
+    """
+    contradicted = np.asarray(matches.odometry_weight) < 0.5
+    wheels, found = odometry[:, 0], np.asarray(matches.increment, float)[:, 0]
+    mirrored = (wheels > 0.0) & (np.abs(found + wheels) < MIRRORED * wheels)
+    num_mirrored = int(np.sum(contradicted & mirrored))
+    if num_mirrored < max(MIN_MIRRORED, int(np.sum(contradicted)) / 2):
+        return ()
+    return (f"wheels report driving backwards as driving forwards at {num_mirrored} scans",)
 
 
 def wrong_scale(matches: ScanMatch, odometry: np.ndarray) -> tuple[str, ...]:

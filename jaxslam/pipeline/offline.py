@@ -171,6 +171,7 @@ def run_slam(
     topological_map = online.topological_map(config, state, keyframe_poses)
     if matched.matches is not None and config.scan_matching.use_odometry:
         notes += odometry_notes.contradictions(matched.matches)
+        notes += odometry_notes.unsigned(matched.matches, matched.odometry)
         notes += odometry_notes.wrong_scale(matched.matches, matched.odometry)
     return SlamResult(
         poses,

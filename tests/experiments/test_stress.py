@@ -10,9 +10,9 @@ from experiments.log_folder import Log
 from jaxslam.cli import main
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.se2_np import dead_reckoning, relative
+from jaxslam.core.se2_np import dead_reckoning, increments, relative
 from jaxslam.io import readers, tum
-from jaxslam.pipeline import offline
+from jaxslam.pipeline import log_input, odometry_notes, offline, online
 
 T, R = 60, 36
 LIDAR = Lidar(R, -np.pi / 2, np.pi / R, 20.0, 0.02)
@@ -187,3 +187,17 @@ def test_a_case_is_run_as_by_the_command_line(how, tmp_path, monkeypatch):
 def test_bad_input_is_one_line(more, message, tmp_path, capsys):
     assert stress.main(arguments(tmp_path / "a", *more)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "a").exists()
+
+
+@pytest.mark.slow
+def test_wheels_that_report_driving_backwards_as_forwards_are_found_out_and_noted(tmp_path):
+    """Where the sign is believed, a drive of 0.25 m a scan is off by up to half a metre."""
+    source = stress.simulated(0, 0)
+    drive_records.write(tmp_path / "a.clf", hurt_logs.hurt("unsigned", 0, source.recording))
+    log = log_input.from_laser_log(readers.read_log(tmp_path / "a.clf"))
+    true = increments(source.truth)
+    assert np.sum(true[:, 0] < -0.2) > 40 and log.increments[:, 0].min() > -1e-3
+    matches = online.match_log(log.config, log.increments, log.scans)
+    off = relative(true, np.asarray(matches.increment))
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.1
+    assert odometry_notes.unsigned(matches, log.increments) != ()

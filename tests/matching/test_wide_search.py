@@ -110,11 +110,18 @@ def test_equal_places_are_ambiguous_rather_than_guessed():
     np.testing.assert_allclose(found[1, 1], 1e6, rtol=1e-6)
 
 
+def next_history(history, step, contradicted=False, wheels=None):
+    wheels = step if wheels is None else wheels
+    wheels = motion_prior.wheel_motion(SPEC, history, wheels, jnp.array(False))
+    ones = jnp.ones(())
+    return motion_prior.next_history(history, wheels, step, ones, jnp.asarray(contradicted))
+
+
 def history_of(increment, count=40, contradicted=False):
     history = motion_prior.first_history()
     for k in range(count):
         step = increment + 0.005 * (k % 2)
-        history = motion_prior.next_history(history, step, jnp.ones(()), jnp.asarray(contradicted))
+        history = next_history(history, step, contradicted)
     return history
 
 
@@ -128,7 +135,7 @@ def test_wheels_are_trusted_less_the_more_they_are_contradicted_and_it_is_forgot
     expected = motion_prior.expected_motion(history, hanging)
     np.testing.assert_allclose(expected.increment, moved, atol=0.011)
     for _ in range(30):
-        history = motion_prior.next_history(history, moved, jnp.ones(()), jnp.asarray(False))
+        history = next_history(history, moved)
     good = motion_prior.wheel_motion(SPEC, history, moved + 0.01, jnp.array(False))
     assert good.outlier_probability < 0.01
     expected = motion_prior.expected_motion(history, good)
@@ -146,8 +153,12 @@ def test_a_guessed_increment_may_be_wrong_and_off_by_the_usual_change():
     np.testing.assert_allclose(guessed.variance, said.variance + change)
 
 
-def test_the_density_of_the_pose_is_that_of_a_mixture_of_two_student_t_distributions():
+@pytest.mark.parametrize("reversed_before", [False, True])
+def test_the_density_of_the_pose_is_that_of_a_mixture_of_student_t_distributions(reversed_before):
     history = history_of(jnp.array([0.3, 0.0, 0.1]))
+    if reversed_before:
+        back = next_history(history, history.increment, wheels=jnp.array([-0.1, 0.0, 0.0]))
+        history = history._replace(wheels_reverse=back.wheels_reverse)
     wheels = motion_prior.WheelMotion(
         jnp.array([0.1, 0.05, -0.2]), jnp.array([0.01, 0.02, 0.03]), jnp.array(0.3)
     )
@@ -155,11 +166,14 @@ def test_the_density_of_the_pose_is_that_of_a_mixture_of_two_student_t_distribut
     found = motion_prior.pose_hypotheses(history, wheels, before)
     change = np.asarray(motion_prior.change_variance(history))
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
+    unsigned = 0.0 if reversed_before else 0.01
+    backwards = wheels.increment * jnp.array([-1.0, 1.0, 1.0])
     parts = [
         (weight, multivariate_t(np.asarray(compose(before, mean)), turn @ cov @ turn.T, df=3))
         for weight, mean, cov in (
-            (0.7, wheels.increment, np.diag(wheels.variance)),
-            (0.3, history.increment, np.diag(change)),
+            (0.7 * (1 - unsigned), wheels.increment, np.diag(wheels.variance)),
+            (0.3 * (1 - unsigned), history.increment, np.diag(change)),
+            (unsigned, backwards, np.diag(wheels.variance)),
         )
     ]
     poses = np.asarray(before) + rng.normal(size=(20, 3)) * 0.2

@@ -33,3 +33,14 @@ def test_contradictions_are_counted():
     weight[:3] = 0.2
     found = odometry_notes.contradictions(matches_of(np.zeros((200, 3)), weight))
     assert "3 of 200 scans" in found[0]
+
+
+def test_wheels_without_a_sign_are_noted_where_scans_say_the_opposite():
+    odometry, weight = np.tile([0.3, 0.0, 0.0], (100, 1)), np.ones(100)
+    weight[:12] = 0.0
+    matches = matches_of(odometry, weight)
+    assert odometry_notes.unsigned(matches, odometry) == ()
+    matches.increment[:10, 0] = -0.25
+    assert "at 10 scans" in odometry_notes.unsigned(matches, odometry)[0]
+    matches.increment[5:10, 0] = 0.02
+    assert odometry_notes.unsigned(matches, odometry) == ()

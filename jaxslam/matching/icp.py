@@ -25,9 +25,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.scan import Lidar
-from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
+from jaxslam.core.se2 import dot, transform, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.matching.correlative import CorrelativeSpec
 from jaxslam.matching.oriented_points import OrientedPoints, beam_towards
@@ -214,8 +213,7 @@ def icp(
         information, descent = _normal_equations(spec, kernel, pairs, pose, points)
         offset = prior.pose - pose
         descent = descent + prior.information @ offset.at[2].set(wrap_angle(offset[2]))
-        root = inverse_cholesky(information + prior.information)[0]
-        return pose + root.T @ (root @ descent), None
+        return pose + _solve(information + prior.information, descent), None
 
     def iterate(pose: Array, scales: tuple[Array, Array]) -> tuple[Array, None]:
         gate, kernel = scales
@@ -291,19 +289,18 @@ def _normal_equations(
     spec: ScanMatchSpec, kernel: Array, pairs: _Correspondences, pose: Array, points: Array
 ) -> tuple[Array, Array]:
     """H (3, 3) and -sum w J^T e / point_std^2 (3,) at a pose (3,), points (N, 2) in robot frame."""
-    x, y = (points @ rotation(pose[2]).T).T
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    x, y = cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]
     normal_x, normal_y = pairs.normal[..., 0], pairs.normal[..., 1]
     error = normal_x * (x + pose[0])[None] + normal_y * (y + pose[1])[None] - pairs.offset
-    weight = pairs.share / (1.0 + (error / kernel) ** 2) ** 2
+    weight = pairs.share / (1.0 + (error / kernel) ** 2) ** 2 / spec.point_std**2
     by_heading = normal_y * x[None] - normal_x * y[None]
-    jacobian = normal_x, normal_y, by_heading
+    columns = jnp.stack([normal_x, normal_y, by_heading, -error]).reshape(4, -1)
+    square = (columns[:3] * weight.reshape(1, -1)) @ columns.T
+    return square[:, :3], square[:, 3]
 
-    def total(first: Array, second: Array) -> Array:
-        return jnp.sum(weight * first * second)
 
-    upper = {(i, j): total(jacobian[i], jacobian[j]) for i in range(3) for j in range(i, 3)}
-    square = jnp.stack(
-        [jnp.stack([upper[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)]
-    )
-    descent = jnp.stack([total(column, -error) for column in jacobian])
-    return square / spec.point_std**2, descent / spec.point_std**2
+def _solve(a: Array, b: Array) -> Array:
+    """Solution x (3,) of A x = b with a positive definite A (3, 3), by its cofactors."""
+    rows = jnp.stack([jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])])
+    return rows.T @ b / (a[0] @ rows[0])

@@ -11,8 +11,10 @@ has the density
 of Student t distributions, as each is now and then off by several standard deviations. Here o is
 how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, and `GUESSED_OUTLIER`
 where the log itself says that an increment is a guess. Some robots report the speed without its
-sign; so u is `MIN_OUTLIER` until the wheels first report driving backwards, and then 0. The quick match needs one
-Gaussian near the right place: both are combined by their information, weighted by 1 - o and o.
+sign; so u is `MIN_OUTLIER` until the wheels first report driving backwards, and then 0.
+
+The quick match needs one Gaussian near the right place: what the wheels say and the motion before
+are combined by their information, weighted by 1 - o and o.
 
 Wheels may also be wrong by the same factor all the time: a tyre that is worn or soft makes every
 distance some percent too long. The scale is learned during the drive, by a Kalman filter of one
@@ -204,20 +206,21 @@ def change_variance(history: MotionHistory) -> Array:
     return _per_axis(2.0 * history.usual_change) ** 2
 
 
-def need_a_look(spec: ScanMatchSpec, history: MotionHistory, wheels: WheelMotion) -> Array:
-    """Whether wheels are not to be followed without a look around; () bool.
-
-    Trusted wheels report a change of the motion far beyond what is usual; or they were contradicted
-    of late, and rule out the motion before.
-    """
+def leap(spec: ScanMatchSpec, history: MotionHistory, wheels: WheelMotion) -> Array:
+    """Whether trusted wheels report a change of the motion far beyond what is usual; () bool."""
     if not spec.use_odometry:
         return jnp.zeros((), bool)
     change = magnitude(difference(history.increment, wheels.increment))
     usual = MAX_STD * (history.usual_change + jnp.array(LEAST_CHANGE))
     far = change > jnp.maximum(usual, jnp.array(ICP_REACH))
-    leap = jnp.any(far) & (wheels.outlier_probability < GUESSED_OUTLIER)
-    again = (history.contradicted > MIN_CONTRADICTED) & contradicts(wheels, history.increment)
-    return leap | again
+    return jnp.any(far) & (wheels.outlier_probability < GUESSED_OUTLIER)
+
+
+def wrong_again(spec: ScanMatchSpec, history: MotionHistory, wheels: WheelMotion) -> Array:
+    """Whether the wheels were contradicted of late, and rule out the motion before; () bool."""
+    if not spec.use_odometry:
+        return jnp.zeros((), bool)
+    return (history.contradicted > MIN_CONTRADICTED) & contradicts(wheels, history.increment)
 
 
 def contradicts(wheels: WheelMotion, increment: Array) -> Array:

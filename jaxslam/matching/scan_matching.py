@@ -39,11 +39,12 @@ from jaxslam.matching.motion_prior import (
     contradicts,
     expected_motion,
     first_history,
+    leap,
     learn_scale,
-    need_a_look,
     next_history,
     pose_hypotheses,
     wheel_motion,
+    wrong_again,
 )
 from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
 from jaxslam.matching.wide_search import search_widely
@@ -169,18 +170,18 @@ def _match_scan(
 
     tracked = _track(spec, lidar, submap, prior, points, hit)
     is_keyframe = _has_moved(spec, submap, tracked.pose)
+    usual = history.usual_inliers - spec.max_inlier_drop
     quick = lax.cond(
-        is_keyframe,
+        is_keyframe | (tracked.inlier_fraction < usual),
         lambda: fine_icp(spec, lidar, submap, prior, tracked.pose, points, hit),
         lambda: tracked,
     )
-    # Scans that are only tracked may wait for the next keyframe, if they explain something.
-    max_drop = spec.max_inlier_drop * jnp.where(is_keyframe, 1.0, 1.5)
-    explains_little = quick.inlier_fraction < history.usual_inliers - max_drop
-    odd = explains_little | guessed | need_a_look(spec, history, wheels)
+    explains_little = quick.inlier_fraction < usual
+    odd = explains_little | guessed | wrong_again(spec, history, wheels)
     odd |= contradicts(wheels, relative(before, quick.pose))
+    leaps = leap(spec, history, wheels)
     match = lax.cond(
-        odd & (submap.num_added > 0),
+        (odd | leaps) & (submap.num_added > 0),
         lambda quick: search_widely(
             spec,
             lidar,
@@ -189,6 +190,7 @@ def _match_scan(
             points,
             hit,
             quick,
+            ~odd,
         ),
         lambda quick: quick,
         quick,

@@ -18,6 +18,7 @@ probabilities p, 1 - p and the offset d between the two,
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +51,7 @@ def search_widely(
     points: Array,
     hit: Array,
     quick: MatchedPose,
+    only_compare: Array,
 ) -> MatchedPose:
     """The quick match, or a better one from a wide window.
 
@@ -61,14 +63,84 @@ def search_widely(
         points: (N, 2) [m] of the scan, robot frame.
         hit: (N,) bool, those of them that exist.
         quick: The quick match.
+        only_compare: () bool, whether the window is searched only if the quick match is worse than
+            one that begins where the motion before would have the robot.
     """
     surfaces = submap.oriented_points
+    information = jnp.diag(
+        1.0 / jnp.array([spec.search_std[0], spec.search_std[0], spec.search_std[1]]) ** 2
+    )
+
+    def refine(start: Array) -> MatchedPose:
+        prior = PosePrior(start, information)
+        return fine_icp(spec, lidar, submap, prior, start, points, hit)
+
+    def value(match: MatchedPose) -> Array:
+        contradicted = contradicted_fraction(
+            lidar, surfaces, submap.poses, transform(match.pose, points), hit
+        )
+        unlikely = correlative.surprise(spec.search, log_density(hypotheses, match.pose))
+        value = (match.inlier_fraction - contradicted) / 2 - unlikely
+        return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+
+    def candidates() -> Array:
+        return _candidates(spec, surfaces, hypotheses, points, hit, quick)
+
+    # Begun where the wheels had the robot; then where the motion before has it; then the search.
+    num_found = 2 + spec.search.num_candidates
+    found = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_found, *x.shape)), quick)
+    values = jnp.full(num_found, -jnp.inf, quick.pose.dtype).at[0].set(value(quick) + spec.min_gain)
+    starts = jnp.broadcast_to(hypotheses.poses[1], (num_found, 3))
+
+    def is_left(state: _Refining) -> Array:
+        settled = only_compare & (state.number == 2) & (state.values[0] >= state.values[1])
+        return (state.number < num_found) & ~settled
+
+    def body(state: _Refining) -> _Refining:
+        number, starts, found, values = state
+        starts = lax.cond(
+            number == 2, lambda starts: starts.at[2:].set(candidates()), lambda s: s, starts
+        )
+        match = refine(starts[number])
+        found = jax.tree.map(lambda held, one: held.at[number].set(one), found, match)
+        return _Refining(number + 1, starts, found, values.at[number].set(value(match)))
+
+    state = lax.while_loop(is_left, body, _Refining(jnp.int32(1), starts, found, values))
+    found, values = state.found, state.values
+    match = jax.tree.map(lambda x: x[jnp.argmax(values)], found)
+    off = found.pose - match.pose[None]
+    near = jnp.hypot(off[:, 0], off[:, 1]) < SAME_PLACE[0]
+    same = near & (jnp.abs(wrap_angle(off[:, 2])) < SAME_PLACE[1])
+    elsewhere = jnp.where(same, -jnp.inf, values)
+    other = found.pose[jnp.argmax(elsewhere)]
+    behind = jnp.max(elsewhere) - jnp.max(values)
+    return match._replace(information=spread_over(match, other, behind))
+
+
+class _Refining(NamedTuple):
+    """State while E poses are refined: the next one's number, starts, matches [E], and values."""
+
+    number: Array
+    starts: Array
+    found: MatchedPose
+    values: Array
+
+
+def _candidates(
+    spec: ScanMatchSpec,
+    surfaces: OrientedPoints,
+    hypotheses: PoseHypotheses,
+    points: Array,
+    hit: Array,
+    quick: MatchedPose,
+) -> Array:
+    """Candidates (C, 3) of the correlative search around the middle of wheels and motion before."""
     first, second = hypotheses.poses[:2]
     turn = wrap_angle(second[2] - first[2])
     middle = jnp.stack(
         [(first[0] + second[0]) / 2, (first[1] + second[1]) / 2, first[2] + turn / 2]
     )
-    candidates = correlative.search(
+    return correlative.search(
         spec.search,
         surfaces.points.reshape(-1, 2),
         surfaces.valid.ravel(),
@@ -78,35 +150,6 @@ def search_widely(
         hit,
         quick.inlier_fraction < spec.lost_inliers,
     ).poses
-    information = jnp.diag(
-        1.0 / jnp.array([spec.search_std[0], spec.search_std[0], spec.search_std[1]]) ** 2
-    )
-
-    def refine(start: Array) -> MatchedPose:
-        prior = PosePrior(start, information)
-        return fine_icp(spec, lidar, submap, prior, start, points, hit)
-
-    # The quick match began where the wheels had it.
-    refined = lax.map(refine, jnp.concatenate([candidates, hypotheses.poses[1:]]))
-    found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), quick, refined)
-
-    def value(match: MatchedPose) -> Array:
-        contradicted = contradicted_fraction(
-            lidar, surfaces, submap.poses, transform(match.pose, points), hit
-        )
-        unlikely = correlative.surprise(spec.search, log_density(hypotheses, match.pose))
-        return (match.inlier_fraction - contradicted) / 2 - unlikely
-
-    values = jax.vmap(value)(found).at[0].add(spec.min_gain)
-    values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
-    match = jax.tree.map(lambda x: x[jnp.argmax(values)], found)
-    off = found.pose - match.pose[None]
-    near = jnp.hypot(off[:, 0], off[:, 1]) < SAME_PLACE[0]
-    same = near & (jnp.abs(wrap_angle(off[:, 2])) < SAME_PLACE[1])
-    elsewhere = jnp.where(same, -jnp.inf, values)
-    other = found.pose[jnp.argmax(elsewhere)]
-    behind = jnp.max(elsewhere) - jnp.max(values)
-    return match._replace(information=spread_over(match, other, behind))
 
 
 def contradicted_fraction(

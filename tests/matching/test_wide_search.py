@@ -183,18 +183,52 @@ def test_the_density_of_the_pose_is_that_of_a_mixture_of_student_t_distributions
     np.testing.assert_allclose(fast, slow - peak, rtol=1e-3, atol=1e-3)
 
 
-def test_wheels_need_a_look_where_they_leap_or_were_wrong_of_late_and_rule_out_the_motion_before():
+def test_wheels_leap_where_the_motion_changes_by_more_than_is_usual():
     step = jnp.array([0.2, 0.0, 0.05])
     history = history_of(step)
     wheels = motion_prior.wheel_motion(SPEC, history, step + 0.02, jnp.array(False))
-    assert not motion_prior.need_a_look(SPEC, history, wheels)
+    assert not motion_prior.leap(SPEC, history, wheels)
     leap = wheels._replace(increment=jnp.zeros(3))
-    assert motion_prior.need_a_look(SPEC, history, leap)
-    assert not motion_prior.need_a_look(SCANS_ONLY, history, leap)
+    assert motion_prior.leap(SPEC, history, leap)
+    assert not motion_prior.leap(SCANS_ONLY, history, leap)
     known = leap._replace(outlier_probability=jnp.ones(()))
-    assert not motion_prior.need_a_look(SPEC, history, known)
+    assert not motion_prior.leap(SPEC, history, known)
+    assert not motion_prior.wrong_again(SPEC, history, known)
     wrong_of_late = history._replace(contradicted=jnp.array(0.4))
-    assert motion_prior.need_a_look(SPEC, wrong_of_late, known)
+    assert motion_prior.wrong_again(SPEC, wrong_of_late, known)
+    assert not motion_prior.wrong_again(SCANS_ONLY, wrong_of_late, known)
+    right = known._replace(increment=step)
+    assert not motion_prior.wrong_again(SPEC, wrong_of_late, right)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_a_quick_match_that_the_motion_before_does_not_better_is_kept_without_a_search(
+    drive, monkeypatch, right
+):
+    poses, scans = drive
+    submap, now = empty_submap(SPEC, LIDAR), 8
+    first = jax.tree.map(lambda x: x[:now], scans)
+    submap, _ = match_scans(SPEC, LIDAR, submap, first, odometry_of(poses)[:now])
+    step = odometry_of(poses)[now]
+    true = compose(submap.last_pose, step)
+    wheels = motion_prior.WheelMotion(step, 0.01 * jnp.ones(3), jnp.zeros(()))
+    hypotheses = motion_prior.pose_hypotheses(submap.motion, wheels, submap.last_pose)
+    scan = jax.tree.map(lambda x: x[now], scans)
+    points, hit = lidar.beam_ends(LIDAR, scan), scan.hit
+    pose = true if right else true.at[:2].add(0.7)
+    quick = MatchedPose(pose, 1e4 * jnp.eye(3), jnp.where(right, 0.95, 0.5))
+    searches = []
+    candidates = wide_search._candidates
+    monkeypatch.setattr(
+        wide_search,
+        "_candidates",
+        lambda *given: (jax.debug.callback(lambda: searches.append(1)), candidates(*given))[1],
+    )
+    given = SPEC, LIDAR, submap, hypotheses, points, hit, quick
+    found = wide_search.search_widely(*given, jnp.array(True))
+    jax.effects_barrier()
+    assert len(searches) == (0 if right else 1)
+    np.testing.assert_allclose(found.pose, true, atol=0.03)
 
 
 def slow_contradicted(lidar, clouds, poses, points):

@@ -170,13 +170,14 @@ def _match_scan(
 
     tracked = _track(spec, lidar, submap, prior, points, hit)
     is_keyframe = _has_moved(spec, submap, tracked.pose)
-    usual = history.usual_inliers - spec.max_inlier_drop
     quick = lax.cond(
-        is_keyframe | (tracked.inlier_fraction < usual),
+        is_keyframe,
         lambda: fine_icp(spec, lidar, submap, prior, tracked.pose, points, hit),
         lambda: tracked,
     )
-    explains_little = quick.inlier_fraction < usual
+    # Scans that are only tracked may wait for the next keyframe, if they explain something.
+    max_drop = spec.max_inlier_drop * jnp.where(is_keyframe, 1.0, 1.5)
+    explains_little = quick.inlier_fraction < history.usual_inliers - max_drop
     odd = explains_little | guessed | wrong_again(spec, history, wheels)
     odd |= contradicts(wheels, relative(before, quick.pose))
     leaps = leap(spec, history, wheels)

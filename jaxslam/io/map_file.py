@@ -20,7 +20,7 @@ from jaxslam.mapping.saved_map import SavedMap
 
 NAME = "map.npz"  # of the file in the output folder of `jaxslam run`
 FORMAT, VERSION = "jaxslam-map", 1
-MAX_BYTES = 2**30  # of all arrays, unpacked
+MAX_BYTES = 2**31  # of all arrays, unpacked
 _OURS = f"name a {NAME} or output folder of `jaxslam run`"
 _AGAIN = "copy the file again, or make it by `jaxslam run`"
 

@@ -105,8 +105,11 @@ def test_a_later_session_loads_what_a_run_has_saved(tmp_path, monkeypatch):
     ranges = np.asarray(given.scans.ranges, np.float32)[keyframes]
     np.testing.assert_array_equal(saved.scans.ranges, ranges)
     assert saved.lidar == given.config.frontend.lidar
-    np.testing.assert_array_equal(saved.belief.landmark_positions, _positions(result)[used])
-    np.testing.assert_allclose(saved.belief.cov, np.asarray(result.belief.cov)[_rows(used)])
+    positions = np.asarray(result.belief.landmark_positions)
+    np.testing.assert_array_equal(saved.belief.landmark_positions, positions[used])
+    rows = np.concatenate([np.ones(3, bool), np.repeat(used, 2)])  # of pose and used landmarks
+    cov = np.asarray(result.belief.cov)[np.ix_(rows, rows)]
+    np.testing.assert_allclose(saved.belief.cov, cov)
     assert used.sum() > 2 and not used.all() and len(result.topological_map.id) > 1
     # The landmarks and arcs in the file are all that the topological map is made of.
     state = SlamState(saved.belief, saved.arcs, None)
@@ -117,16 +120,6 @@ def test_a_later_session_loads_what_a_run_has_saved(tmp_path, monkeypatch):
     assert [f["properties"]["id"] for f in points] == saved.topological_map.id.tolist()
     xy = [f["geometry"]["coordinates"] for f in points]
     np.testing.assert_array_equal(xy, saved.topological_map.xy)
-
-
-def _positions(result):
-    return np.asarray(result.belief.landmark_positions)
-
-
-def _rows(used):
-    """Index of the rows and columns of pose and used landmarks."""
-    rows = np.concatenate([np.ones(3, bool), np.repeat(used, 2)])
-    return np.ix_(rows, rows)
 
 
 @pytest.mark.slow

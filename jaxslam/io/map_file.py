@@ -65,7 +65,7 @@ def load_map(path: str | PathLike) -> SavedMap:
         return read(path)
     file = os.path.join(path, NAME)
     if not os.path.exists(file):
-        advice = "name an output folder of `jaxslam run`, or run it again where it is of old"
+        advice = "name an output folder of `jaxslam run`; older versions wrote no map: run it again"
         raise InputError(f"holds no {NAME}", path=path, advice=advice)
     return read(file)
 

@@ -19,12 +19,12 @@ if _TYPE_CHECKING:
     from jaxslam.filtering.noise import NoiseParams as NoiseParams
     from jaxslam.filtering.slam_filter import run_filter as run_filter
     from jaxslam.filtering.slam_filter import step as step
+    from jaxslam.io.map_file import load_map as load_map
     from jaxslam.io.readers import read_log as read_log
     from jaxslam.pipeline.config import Config as Config
     from jaxslam.pipeline.episodes import episode_from_arrays as episode_from_arrays
     from jaxslam.pipeline.episodes import filter_episodes as filter_episodes
     from jaxslam.pipeline.offline import run_slam as run_slam
-    from jaxslam.simulation.robot import Robot as Robot
     from jaxslam.simulation.trials import run_trials as run_trials
     from jaxslam.simulation.trials import simulate_episodes as simulate_episodes
     from jaxslam.tuning.fitting import tune as tune
@@ -37,12 +37,12 @@ _MODULES = {
     "Lidar": "core.scan",
     "Measurement": "core.measurement",
     "NoiseParams": "filtering.noise",
-    "Robot": "simulation.robot",
     "enable_caches": "core.caches",
     "episode_from_arrays": "pipeline.episodes",
     "evaluate": "evaluation.summary",
     "filter_episodes": "pipeline.episodes",
     "init": "filtering.config",
+    "load_map": "io.map_file",
     "read_log": "io.readers",
     "run_filter": "filtering.slam_filter",
     "run_slam": "pipeline.offline",

@@ -14,13 +14,14 @@ from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, ros_map, tum
+from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, tum
 from jaxslam.io.geojson import Arc, Node
 from jaxslam.io.output import write_json
 from jaxslam.mapping import pose_graph
 from jaxslam.mapping.occupancy import occupancy_map
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import SlamResult
+from jaxslam.pipeline.saving import to_saved_map
 from jaxslam.simulation.worlds import World
 from jaxslam.tuning.fitting import TuneResult
 from jaxslam.tuning.parameters import param_names
@@ -76,6 +77,28 @@ def write_maps(
     g2o_writer.write(out_dir / "graph.g2o", graph)
     if find_spec("networkx") is not None:
         graphml.write(out_dir / "map.graphml", result.topological_map)
+
+
+def write_saved_map(
+    out_dir: Path,
+    config: Config,
+    params: NoiseParams,
+    result: SlamResult,
+    times: np.ndarray,
+    scans: Scan,
+) -> None:
+    """Write map.npz, the map for later sessions.
+
+    Args:
+        out_dir: Folder to write to.
+        config: Configuration of the run.
+        params: Noise parameters of the filter.
+        result: Result of SLAM.
+        times: (K,) [s] of the keyframes.
+        scans: [K] of the keyframes.
+    """
+    saved_map = to_saved_map(config, params, result, times, scans)
+    map_file.write(out_dir / map_file.NAME, saved_map)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:

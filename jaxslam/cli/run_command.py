@@ -70,9 +70,10 @@ def run(
     Every scan is matched; filter and maps are given keyframes, 0.3 m or 0.3 rad apart. Writes
     metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson and,
     with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for map_server
-    and `jaxslam map`; and the pose graph graph.g2o, for batch optimisers. The pose of the first
-    scan is the origin of the map. A WARNING names the scans where the map contradicts itself,
-    because the run was lost there; path.png marks them.
+    and `jaxslam map`; the pose graph graph.g2o, for batch optimisers; and map.npz, all that later
+    sessions need of the map, for `jaxslam.load_map`. The pose of the first scan is the origin of
+    the map. A WARNING names the scans where the map contradicts itself, because the run was lost
+    there; path.png marks them.
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is
@@ -156,6 +157,8 @@ def run(
         )
         of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
         report.write_maps(out_dir, config, params, result, measurements, of_keyframes)
+        times = laser_log.times[result.keyframes]
+        report.write_saved_map(out_dir, config, params, result, times, of_keyframes)
         trajectories, error = {"odometry": odom_poses}, None
         if known is not None:
             trajectories["reference"] = log_errors.reference_in_map(

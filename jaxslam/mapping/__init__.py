@@ -14,4 +14,5 @@ from jaxslam.mapping.pose_graph import build_pose_graph as build_pose_graph
 from jaxslam.mapping.routes import Route as Route
 from jaxslam.mapping.routes import find_route as find_route
 from jaxslam.mapping.routes import shortest_path as shortest_path
+from jaxslam.mapping.saved_map import SavedMap as SavedMap
 from jaxslam.mapping.topological_map import build_map as build_map

@@ -18,6 +18,7 @@ from jaxslam.core.types import Array
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
+from jaxslam.mapping.arc_table import ArcTable
 from jaxslam.matching import loop_closure
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.pipeline import arguments, keyframes, odometry_notes, online, stages
@@ -60,6 +61,7 @@ class SlamResult(NamedTuple):
         odometry: (K, 3) [m, m, rad] increments since the keyframe before that the filter was given:
             repaired, or zero where odometry is not used.
         notes: What was wrong with the odometry, to be printed.
+        arcs: Arcs that the topological map is made of, as observed; to go on from.
     """
 
     poses: np.ndarray
@@ -73,6 +75,7 @@ class SlamResult(NamedTuple):
     loop_closures: LoopClosures | None = None
     odometry: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    arcs: ArcTable | None = None
 
 
 def run_slam(
@@ -185,6 +188,7 @@ def run_slam(
         closures,
         keyframe_odometry,
         notes,
+        state.arcs,
     )
 
 

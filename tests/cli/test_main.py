@@ -109,6 +109,13 @@ def load(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
+def nodes(folder):
+    """Positions in map.geojson of the nodes by id."""
+    features = json.loads((folder / "map.geojson").read_text())["features"]
+    points = [f for f in features if f["geometry"]["type"] == "Point"]
+    return {f["properties"]["id"]: f["geometry"]["coordinates"] for f in points}
+
+
 def check_map(folder):
     features = json.loads((folder / "map.geojson").read_text())["features"]
     kinds = {f["properties"].get("metadata", {}).get("kind") for f in features}
@@ -170,7 +177,7 @@ def test_evo_reads_the_trajectories(done):
 @pytest.mark.slow
 def test_run_writes_its_files_and_nothing_else(done):
     names = {"metrics.json", "trajectory.tum", "map.geojson", "map.graphml", "map.yaml", "map.pgm"}
-    names |= {"graph.g2o", "scan.png", "run.gif", *PICTURES}
+    names |= {"map.npz", "graph.g2o", "scan.png", "run.gif", *PICTURES}
     assert {file.name for file in done.recorded.iterdir()} == names
     assert [file.name for file in done.recorded.parent.iterdir()] == ["recorded"]
     check_map(done.recorded)
@@ -202,6 +209,21 @@ def test_networkx_reads_the_graph(done):
     assert len(graph) == sum(
         f["geometry"]["type"] == "Point"
         for f in json.loads((done.recorded / "map.geojson").read_text())["features"]
+    )
+
+
+@pytest.mark.slow
+def test_the_saved_map_is_that_of_the_other_files(done):
+    """Nodes of map.geojson, and poses, smoothed, of trajectory.tum at the keyframes."""
+    saved = jaxslam.load_map(done.recorded)
+    times, poses = tum.read(done.recorded / "trajectory.tum")
+    assert len(saved.times) == load(done.recorded)["keyframes"]
+    of_keyframes = np.searchsorted(times, saved.times)
+    np.testing.assert_array_equal(times[of_keyframes], saved.times)
+    np.testing.assert_allclose(saved.poses, poses[of_keyframes], atol=1e-6)
+    assert saved.scans.ranges.dtype == saved.belief.mean.dtype == np.float32
+    assert nodes(done.recorded) == dict(
+        zip(saved.topological_map.id.tolist(), saved.topological_map.xy.tolist(), strict=True)
     )
 
 

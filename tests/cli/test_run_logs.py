@@ -2,13 +2,16 @@
 
 import json
 
+import jax
 import layouts
 import numpy as np
 import pytest
 
+import jaxslam
 from jaxslam.cli import main
 from jaxslam.core.se2_np import compose
 from jaxslam.io import tum
+from jaxslam.pipeline import SlamState, log_input, topological_map
 
 
 def refused(capsys, *arguments):
@@ -74,16 +77,55 @@ def room_scan(pose, beams=180):
     return np.minimum(east_west, north_south)
 
 
-@pytest.mark.slow
-def test_poses_of_the_robot_and_notes(tmp_path, capsys):
-    """Those of the scanner are the robot's, moved by the mount."""
-    mount, log = np.array([0.3, -0.1, 0.5]), tmp_path / "a"
+def room_log(path):
+    """A bag of a drive in the room."""
     poses = iter(layouts.true_poses())
     said = [
         m._replace(data=room_scan(next(poses))) if m.kind == "scan" else m
         for m in layouts.messages()
     ]
-    layouts.bag(log, said)
+    layouts.bag(path, said)
+    return path
+
+
+@pytest.mark.slow
+def test_a_later_session_loads_what_a_run_has_saved(tmp_path, monkeypatch):
+    results, run = [], log_input.run
+    monkeypatch.setattr(
+        log_input, "run", lambda *a, **k: results.append(run(*a, **k)) or results[0]
+    )
+    log = room_log(tmp_path / "a")
+    assert main.main(["run", str(log), "--no-smooth", "--out", str(tmp_path / "out")]) == 0
+    saved, (result,) = jaxslam.load_map(tmp_path / "out"), results
+    given = log_input.from_laser_log(jaxslam.read_log(log))
+    keyframes, used = result.keyframes, np.asarray(result.belief.num_seen) > 0
+    np.testing.assert_array_equal(saved.poses, result.poses[keyframes])
+    np.testing.assert_array_equal(saved.times, jaxslam.read_log(log).times[keyframes])
+    np.testing.assert_array_equal(saved.scans.hit, np.asarray(given.scans.hit)[keyframes])
+    ranges = np.asarray(given.scans.ranges, np.float32)[keyframes]
+    np.testing.assert_array_equal(saved.scans.ranges, ranges)
+    assert saved.lidar == given.config.frontend.lidar
+    positions = np.asarray(result.belief.landmark_positions)
+    np.testing.assert_array_equal(saved.belief.landmark_positions, positions[used])
+    rows = np.concatenate([np.ones(3, bool), np.repeat(used, 2)])  # of pose and used landmarks
+    cov = np.asarray(result.belief.cov)[np.ix_(rows, rows)]
+    np.testing.assert_allclose(saved.belief.cov, cov)
+    assert used.sum() > 2 and not used.all() and len(result.topological_map.id) > 1
+    # The landmarks and arcs in the file are all that the topological map is made of.
+    state = SlamState(saved.belief, saved.arcs, None)
+    for graph in (saved.topological_map, topological_map(given.config, state, saved.poses)):
+        jax.tree.map(np.testing.assert_array_equal, graph, result.topological_map)
+    features = json.loads((tmp_path / "out" / "map.geojson").read_text())["features"]
+    points = [f for f in features if f["geometry"]["type"] == "Point"]
+    assert [f["properties"]["id"] for f in points] == saved.topological_map.id.tolist()
+    xy = [f["geometry"]["coordinates"] for f in points]
+    np.testing.assert_array_equal(xy, saved.topological_map.xy)
+
+
+@pytest.mark.slow
+def test_poses_of_the_robot_and_notes(tmp_path, capsys):
+    """Those of the scanner are the robot's, moved by the mount."""
+    mount, log = np.array([0.3, -0.1, 0.5]), room_log(tmp_path / "a")
     found = {}
     for frame in ("scanner", "base"):
         out = tmp_path / frame

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import test_carmen
 import test_g2o
+import test_map_file
 import test_mrclam
 import test_npz
 import test_ros_bags
@@ -17,10 +18,10 @@ import test_ros_map
 from PIL import Image
 
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.io import mrclam, noise_file, npz, readers, relations, ros_map, tum
+from jaxslam.io import map_file, mrclam, noise_file, npz, readers, relations, ros_map, tum
 from jaxslam.io.errors import InputError
 
-COUNT = 160  # damaged files of each kind: 3,040 of all nineteen
+COUNT = 160  # damaged files of each kind: 3,200 of all twenty
 MEMORY = 2**20  # [kB] that reading them all may take beyond what the tests had before
 HUGE = (b"1e999", b"-1e308", b"9" * 400, b"nan", b"-inf", b"1e-320", b"0", b"-1", b"", b"x\xff\x00")
 
@@ -150,6 +151,11 @@ def arrays(path):
     return path
 
 
+def saved(path):
+    map_file.write(path, test_map_file.saved_map())
+    return path
+
+
 def picture(path):
     fields = "".join(f"{name}: {value}\n" for name, value in test_ros_map.FIELDS.items())
     path.write_text(fields)
@@ -196,6 +202,7 @@ KINDS = {
     "drive.bag": (lambda p: bag(p, 1), readers.read_log),
     "drive": (lambda p: bag(p, 2), readers.read_log),
     "described": (metadata, parent),
+    "map.npz": (saved, map_file.read),
     "map.yaml": (picture, ros_map.read),
     "map.pgm": (lambda p: picture(p.with_suffix(".yaml")).with_suffix(".pgm"), map_of),
     "drive.tum": (lambda p: text(p, ["0.5 1 2 0 0 0 0.6 0.8"] * 5), tum.read),

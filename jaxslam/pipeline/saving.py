@@ -1,0 +1,61 @@
+"""From the result of SLAM to the map that is kept for later sessions."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxslam.core.scan import Scan
+from jaxslam.core.types import as_float64, check_array, check_type
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.mapping.saved_map import SavedMap, used_arcs, used_landmarks
+from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.offline import SlamResult
+
+
+def to_saved_map(
+    config: Config, params: NoiseParams, result: SlamResult, times: Any, scans: Scan
+) -> SavedMap:
+    """The map that a result of `run_slam` leaves, for `io.map_file.write`.
+
+    Args:
+        config: Of the run; its scanner is kept.
+        params: Q and R of the filter.
+        result: Of the run, K keyframes.
+        times: (K,) [s] of the keyframes.
+        scans: [K] of the keyframes: ranges (K, R) [m] and hit (K, R).
+
+    Raises:
+        ValueError: Times or scans are not those of K keyframes of this scanner; or the result has
+            no arcs.
+    """
+    for name, record, kind in (
+        ("config", config, Config),
+        ("params", params, NoiseParams),
+        ("result", result, SlamResult),
+        ("scans", scans, Scan),
+    ):
+        check_type(name, record, kind)
+    if result.arcs is None:
+        raise ValueError("result.arcs is None: give the result of run_slam")
+    count, lidar = len(result.keyframes), config.frontend.lidar
+    hit = np.asarray(scans.hit)
+    check_array("scans.hit", hit, (count, lidar.num_beams), np.bool_)
+    ranges = as_float64("scans.ranges", scans.ranges, hit.shape).astype(np.float32)
+    return SavedMap(
+        lidar=lidar,
+        params=jax.tree.map(np.asarray, params),
+        times=as_float64("times", times, (count,)),
+        poses=np.asarray(result.poses, np.float64)[result.keyframes],
+        pose_cov=np.asarray(result.info.pose_cov, np.float32),
+        scans=Scan._make((np.where(hit, ranges, np.float32(lidar.range_max)), hit)),
+        belief=used_landmarks(result.belief),
+        arcs=used_arcs(result.arcs),
+        topological_map=jax.tree.map(_as_64_bits, result.topological_map),
+    )
+
+
+def _as_64_bits(x: Any) -> np.ndarray:
+    """Integers or floats in 64 bits."""
+    x = np.asarray(x)
+    return x.astype(np.float64 if x.dtype.kind == "f" else np.int64)

@@ -213,7 +213,7 @@ def icp(
         information, descent = _normal_equations(spec, kernel, pairs, pose, points)
         offset = prior.pose - pose
         descent = descent + prior.information @ offset.at[2].set(wrap_angle(offset[2]))
-        return pose + _solve(information + prior.information, descent), None
+        return pose + solve(information + prior.information, descent), None
 
     def iterate(pose: Array, scales: tuple[Array, Array]) -> tuple[Array, None]:
         gate, kernel = scales
@@ -300,7 +300,7 @@ def _normal_equations(
     return square[:, :3], square[:, 3]
 
 
-def _solve(a: Array, b: Array) -> Array:
+def solve(a: Array, b: Array) -> Array:
     """Solution x (3,) of A x = b with a positive definite A (3, 3), by its cofactors."""
     rows = jnp.stack([jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])])
     return rows.T @ b / (a[0] @ rows[0])

@@ -1,0 +1,236 @@
+"""Place recognition on recorded logs: one scan against the map of all others, without a guess.
+
+Each log of the folder `--data` that has a reference is run as by `jaxslam run`; its keyframes at
+their smoothed poses are the map. Every `--every`th of them is then looked for in a map without it
+("other scans"), and in one without all keyframes that are less than 10 m of driving away ("other
+visits": many of these places were visited only once, and must not be found). A place is right
+within 0.5 m and 10 degrees of the reference, to which the trajectory is aligned. Recall is the
+share of the places with a keyframe of about the same view in the map that were accepted and right.
+"""
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from experiments import common, log_folder
+from experiments.common import Numbers
+from experiments.log_folder import Log
+from experiments.map_warnings import wilson_interval
+from jaxslam.core.caches import enable_caches
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2_np import compose, relative
+from jaxslam.core.time_series import match_times
+from jaxslam.evaluation.trajectory import align_trajectory
+from jaxslam.io.errors import InputError
+from jaxslam.matching.place_index import PlaceSpec, build_index
+from jaxslam.matching.place_recognition import find_places, make_query
+from jaxslam.pipeline import log_input
+
+NAME = "place_recognition"
+RIGHT = (0.5, np.radians(10.0))  # [m], [rad] from the reference
+SAME_VIEW = (1.5, 0.7)  # [m], [rad] between two keyframes
+MIN_PATH = 10.0  # [m] of driving to another visit
+PROTOCOLS = ("other scans", "other visits")
+MARGINS = np.arange(0.0, 0.301, 0.01)
+MAX_KEYFRAMES = 1000  # of a log; each query has a map of its own
+SHARES = (0.125, 0.25, 0.5, 1.0)  # of the keyframes in the maps that time is taken with
+SPEC = PlaceSpec()
+
+
+class Keyframes(NamedTuple):
+    """Keyframes of a run: smoothed poses (K, 3), and those of the reference in the same frame."""
+
+    lidar: Lidar
+    scans: Scan
+    poses: np.ndarray
+    truth: np.ndarray
+
+
+def keyframes_of(log: Log) -> Keyframes:
+    """Run a log, and take its keyframes that the reference has a pose for."""
+    assert log.reference is not None
+    given = log_input.from_laser_log(log.laser_log)
+    result = log_input.run(given)
+    pairs = match_times(log.laser_log.times[result.keyframes], log.reference[0])
+    chosen, poses = result.keyframes[pairs[:, 0]], log.reference[1][pairs[:, 1]]
+    scans = jax.tree.map(lambda x: np.asarray(x)[chosen], given.scans)
+    frame = align_trajectory(poses[:, :2], result.poses[chosen, :2])
+    truth = compose(frame, poses)
+    return Keyframes(given.config.frontend.lidar, scans, result.poses[chosen], truth)
+
+
+def query_all(keyframes: Keyframes, protocol: str, every: int, bar: tqdm) -> list[Numbers]:
+    """A row for each query."""
+    lidar, scans, poses, truth = keyframes
+    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    rows = []
+    for number in range(0, len(poses), every):
+        others = np.arange(len(poses)) != number
+        if protocol == PROTOCOLS[1]:
+            others = np.abs(driven - driven[number]) > MIN_PATH
+        index = build_index(SPEC, lidar, poses[others], _take(scans, others))
+        query = jax.jit(make_query, static_argnums=(0, 1))(
+            SPEC, lidar, jax.tree.map(jnp.asarray, _take(scans, [number])), jnp.zeros((1, 3))
+        )
+        found = find_places(SPEC, index, query)
+        rows.append(
+            {
+                "keyframe": number,
+                "in_map": bool(_within(poses[number], poses[others], SAME_VIEW).any()),
+                "right": bool(_within(truth[number], np.asarray(found.poses[0], float), RIGHT)),
+                "score": float(found.score[0]),
+                "margin": float(found.margin),
+            }
+        )
+        bar.update()
+    return rows
+
+
+def _within(pose: np.ndarray, others: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """Whether other poses (..., 3) are within [m] and [rad] of a pose (3,)."""
+    off = relative(pose, others)
+    near = np.hypot(off[..., 0], off[..., 1]) < limits[0]
+    return near & (np.abs(off[..., 2]) < limits[1])
+
+
+def _take(scans: Scan, chosen: np.ndarray | list[int]) -> Scan:
+    return jax.tree.map(lambda x: x[chosen], scans)
+
+
+def summary(rows: list[Numbers], margin: float = SPEC.min_margin) -> Numbers:
+    """Precision with its 95 % Wilson interval, and recall, of queries at a least margin."""
+    taken = [row for row in rows if row["score"] >= SPEC.min_score and row["margin"] >= margin]
+    right, in_map = sum(row["right"] for row in taken), sum(row["in_map"] for row in rows)
+    known = sum(row["right"] and row["in_map"] for row in taken)
+    low, high = wilson_interval(right, len(taken))
+    return {
+        "queries": len(rows),
+        "in_map": in_map,
+        "accepted": len(taken),
+        "precision": right / len(taken) if taken else None,
+        "precision_low": low,
+        "precision_high": high,
+        "recall": known / in_map if in_map else None,
+    }
+
+
+def timing(keyframes: Keyframes, repeats: int = 30) -> list[Numbers]:
+    """Time of a query against the size of the map: its first keyframes."""
+    rows = []
+    for share in SHARES:
+        some = slice(0, max(int(share * len(keyframes.poses)), 1))
+        scans = _take(keyframes.scans, np.arange(len(keyframes.poses))[some])
+        start = time.perf_counter()
+        index = build_index(SPEC, keyframes.lidar, keyframes.poses[some], scans)
+        built = time.perf_counter() - start
+        first = jax.tree.map(jnp.asarray, _take(scans, [0]))
+        query = make_query(SPEC, keyframes.lidar, first, jnp.zeros((1, 3)))
+        jax.block_until_ready(find_places(SPEC, index, query))
+        times = []
+        for _ in range(repeats):
+            start = time.process_time()
+            jax.block_until_ready(find_places(SPEC, index, query))
+            times.append(time.process_time() - start)
+        rows.append(
+            {
+                "keyframes": len(scans.ranges),
+                "positions": int(index.valid.sum()),
+                "query_ms": 1e3 * float(np.median(times)),
+                "build_s": built,
+            }
+        )
+    return rows
+
+
+def run_log(log: Log, every: int) -> Numbers:
+    """All queries of a log, and the time of one."""
+    keyframes = keyframes_of(log)
+    found: Numbers = {"keyframes": len(keyframes.poses), "rows": {}, "summary": {}}
+    total = len(PROTOCOLS) * len(range(0, len(keyframes.poses), every))
+    with tqdm(total=total, desc=log.name, unit="query") as bar:
+        for protocol in PROTOCOLS:
+            found["rows"][protocol] = query_all(keyframes, protocol, every, bar)
+            found["summary"][protocol] = summary(found["rows"][protocol])
+    return found | {"timing": timing(keyframes)}
+
+
+def text_of(numbers: Numbers) -> str:
+    """The results as text."""
+    lines = []
+    for name, log in numbers["logs"].items():
+        for protocol, one in log["summary"].items():
+            precision = "-" if one["precision"] is None else f"{one['precision']:.3f}"
+            recall = "-" if one["recall"] is None else f"{one['recall']:.2f}"
+            lines.append(
+                f"{name:18} {protocol:13} {one['queries']:4} queries, {one['in_map']:4} in the map,"
+                f" {one['accepted']:4} accepted: precision {precision}"
+                f" ({one['precision_low']:.3f} to {one['precision_high']:.3f}), recall {recall}"
+            )
+        lines += [
+            f"{name:18} map of {row['keyframes']:4} keyframes: {row['query_ms']:.1f} ms a query, "
+            f"index in {row['build_s']:.2f} s"
+            for row in log["timing"]
+        ]
+    return "\n".join(lines)
+
+
+def draw(numbers: Numbers, path: Path) -> None:
+    """Precision against recall as the least margin varies, and the time of a query."""
+    figure, axes = common.canvas(9.5, 4.2, 1, 2)
+    colours = (common.BLUE, common.RED, common.GREEN, common.ORANGE, common.PINK, common.SKY)
+    for k, (name, log) in enumerate(numbers["logs"].items()):
+        colour = colours[k % len(colours)]
+        for protocol, style in zip(PROTOCOLS, ("-", "--"), strict=True):
+            points = [summary(log["rows"][protocol], margin) for margin in MARGINS]
+            known = [(p["recall"], p["precision"]) for p in points if p["precision"] is not None]
+            axes[0, 0].plot(
+                *zip(*known, strict=True), style, color=colour, label=f"{name}, {protocol}"
+            )
+        timing = log["timing"]
+        times = [row["query_ms"] for row in timing]
+        axes[0, 1].plot([row["keyframes"] for row in timing], times, "o-", color=colour, label=name)
+    axes[0, 0].set(xlabel="recall", ylabel="precision", xlim=(0, 1.02), ylim=(0.5, 1.02))
+    axes[0, 0].legend(frameon=False, fontsize=7, loc="lower left")
+    axes[0, 1].set(xlabel="keyframes of the map", ylabel="time of a query, one core [ms]")
+    axes[0, 1].set(xlim=(0, None), ylim=(0, None))
+    axes[0, 1].legend(frameon=False, fontsize=7)
+    figure.savefig(path)
+
+
+@common.report_errors(NAME)
+def main(argv: list[str] | None = None) -> int:
+    """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
+    args = common.parse(__doc__, argv, data="", every=3)
+    if args.every < 1:
+        raise InputError(f"{args.every} is too small", field="--every")
+    enable_caches()
+    logs = log_folder.find_logs(log_folder.checked_folder(args.data), installed=False)
+    names = log_folder.unique_names(logs)
+    chosen = {
+        name: log
+        for name, log in zip(names, logs, strict=True)
+        if log.reference is not None and len(log.laser_log.times) <= MAX_KEYFRAMES
+    }
+    if not chosen:
+        raise InputError(
+            f"no log with a reference trajectory and at most {MAX_KEYFRAMES} scans",
+            advice="name a folder of such logs",
+        )
+    about = {"data": args.data, "every": args.every}
+    cache = common.ResultCache(args.out / f"{NAME}_parts", about)
+    found = {name: cache(name, partial(run_log, log, args.every)) for name, log in chosen.items()}
+    numbers = {"seed": args.seed, "every": args.every, "logs": found}
+    print(text_of(numbers))
+    common.save(args.out, NAME, numbers, draw)
+    cache.clear()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

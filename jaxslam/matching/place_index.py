@@ -1,0 +1,238 @@
+"""Index of a map for place recognition: where its walls are, and where a robot may stand.
+
+It is made once of the keyframes of a map, on the host. All look-ups are by cell, so a query costs
+the same for each pose that is tried, however many keyframes have seen the place:
+
+    surface of a cell: the nearest surface point s of any keyframe, and its normal n
+    positions:         free ones on and beside the path, `PlaceSpec.position_spacing` apart
+    directions:        of each position a histogram of the normals of the walls around it
+
+Normals point to where the surface was seen from; so the two sides of a wall are different, and the
+histogram of a corridor repeats after half a turn, that of most rooms only after a whole one.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+
+from jaxslam.core.batching import pad_to
+from jaxslam.core.scan import Lidar, Scan, check_lidar
+from jaxslam.core.types import AnyArray, Array, as_float64
+from jaxslam.matching import checks
+from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
+
+MARGIN = 2.0
+"""[m] of the grid around all that the keyframes saw."""
+
+GRID_BLOCK = 128
+"""Numbers of cells are multiples of this, so that maps of about one size share a program."""
+
+POSITION_BLOCK = 256
+"""The same for the number of positions."""
+
+DIRECTION_CELL = 1.0
+"""[m] cell in which directions are counted before they are summed around the positions."""
+
+
+class PlaceSpec(NamedTuple):
+    """Options of place recognition; static under jit.
+
+    Attributes:
+        cell: [m] side of a cell of the grid.
+        position_spacing: [m] between two positions of the index.
+        position_offset: [m] from the path up to which there are positions.
+        min_clearance: [m] least distance of a position from any wall.
+        direction_bins: Bins of a whole turn of the histograms; a multiple of four.
+        direction_radius: [m] around a position within which walls count.
+        max_points: Points of a query.
+        coarse_points: Those of them, evenly spaced, that all poses are scored by.
+        coarse_std: [m] of a point's distance from a wall in that score.
+        num_coarse: Poses, those of the best scores, that are refined with these points.
+        num_fine: Poses, the best of those, that are refined with all points.
+        coarse_gates: [m] largest distance of a point from its wall, iteration by iteration.
+        fine_gates: [m] the same in the second refinement.
+        std: [m] of a point's distance from a wall in the final score.
+        num_candidates: C, places that are returned.
+        distinct: [m], [rad] beyond which two poses are different places.
+        min_score: Least score of a place that is accepted.
+        min_margin: Least difference of its score from that of any other place.
+    """
+
+    cell: float = 0.1
+    position_spacing: float = 0.4
+    position_offset: float = 0.6
+    min_clearance: float = 0.2
+    direction_bins: int = 72
+    direction_radius: float = 10.0
+    max_points: int = 120
+    coarse_points: int = 40
+    coarse_std: float = 0.4
+    num_coarse: int = 512
+    num_fine: int = 64
+    coarse_gates: tuple[float, ...] = (0.6, 0.45, 0.3)
+    fine_gates: tuple[float, ...] = (0.2, 0.15, 0.1)
+    std: float = 0.07
+    num_candidates: int = 4
+    distinct: tuple[float, float] = (0.5, 0.17)
+    min_score: float = 0.7
+    min_margin: float = 0.04
+
+
+class PlaceIndex(NamedTuple):
+    """Index of a map; G x H cells, N positions, B bins of directions.
+
+    Attributes:
+        origin: (2,) [m] corner of the grid: cell (i, j) is around origin + cell (i, j).
+        distance: (G, H) [m] to the nearest surface point.
+        normal: (G, H, 2) unit normal of that surface, to where it was seen from.
+        offset: (G, H) [m] n^T (s - origin).
+        positions: (N, 2) [m] map frame.
+        directions: (N, B) share of the walls around whose normals have each direction, from 0 on.
+        valid: (N,) bool, the positions that exist.
+    """
+
+    origin: Array
+    distance: Array
+    normal: Array
+    offset: Array
+    positions: Array
+    directions: Array
+    valid: Array
+
+
+def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> PlaceIndex:
+    """Index of a map.
+
+    Args:
+        spec: Options.
+        lidar: The scanner.
+        poses: (K, 3) [m, m, rad] of the keyframes, map frame.
+        scans: [K] of the keyframes.
+
+    Raises:
+        ValueError: An option is out of range, there is no keyframe, or poses and scans are not K
+            each, those of this lidar, and finite.
+    """
+    check_place_spec(spec)
+    check_lidar(lidar)
+    poses = as_float64("poses", poses, ("K", 3))
+    scans = checks.as_scans("scans", lidar, scans, (len(poses),))
+    if not len(poses) or not np.isfinite(poses).all():
+        raise ValueError("poses are those of no keyframe, or not finite")
+    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(poses, float), scans))
+    seen = surfaces.valid
+    points = surfaces.points[seen].astype(float)
+    normals = _towards(surfaces.normal[seen], points, np.repeat(poses[:, :2], seen.sum(1), axis=0))
+    low = np.min([*points, *poses[:, :2]], axis=0) - MARGIN
+    high = np.max([*points, *poses[:, :2]], axis=0) + MARGIN
+    size = GRID_BLOCK * np.ceil((high - low) / spec.cell / GRID_BLOCK).astype(int)
+    distance, normal, offset = _nearest_surfaces(spec, size, points - low, normals)
+    positions = _positions(spec, poses[:, :2], low, distance)
+    directions = _directions(spec, size * spec.cell, points - low, normals, positions - low)
+    padding = -len(positions) % POSITION_BLOCK
+    valid = np.arange(len(positions) + padding) < len(positions)
+    positions, directions = pad_to((positions, directions), to=len(valid))
+    return PlaceIndex(
+        origin=jnp.asarray(low, float),
+        distance=jnp.asarray(distance, float),
+        normal=jnp.asarray(normal, float),
+        offset=jnp.asarray(offset, float),
+        positions=jnp.asarray(positions, float),
+        directions=jnp.asarray(directions, float),
+        valid=jnp.asarray(valid),
+    )
+
+
+def check_place_spec(spec: PlaceSpec) -> None:
+    """Check the options of place recognition.
+
+    Raises:
+        ValueError: One is out of range; the message names it.
+    """
+    checks.check_static("spec", spec, PlaceSpec)
+    for field in ("cell", "position_spacing", "direction_radius", "coarse_std", "std"):
+        checks.check_positive(f"spec.{field}", getattr(spec, field))
+    counts = "direction_bins max_points coarse_points num_coarse num_fine num_candidates"
+    for field in counts.split():
+        checks.check_at_least(f"spec.{field}", getattr(spec, field), 1)
+    if spec.direction_bins % 4:
+        raise ValueError(f"spec.direction_bins is {spec.direction_bins}, not a multiple of 4")
+    for field in ("coarse_gates", "fine_gates"):
+        for gate in getattr(spec, field):
+            checks.check_positive(f"spec.{field}", gate)
+
+
+@partial(jax.jit, static_argnames="lidar")
+def _surfaces(lidar: Lidar, poses: Array, scans: Scan) -> OrientedPoints:
+    """Oriented points [K] of scans [K], in the frame of their poses (K, 3)."""
+    points = jax.vmap(partial(oriented_points, lidar))(scans)
+    return jax.vmap(transform_points)(poses, points)
+
+
+def _towards(normals: np.ndarray, points: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Normals (N, 2) of surface points (N, 2), turned to where each was seen from (N, 2)."""
+    away = np.sum(normals * (positions - points), axis=1) < 0.0
+    return np.where(away[:, None], -normals, normals).astype(float)
+
+
+def _nearest_surfaces(
+    spec: PlaceSpec, size: np.ndarray, points: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance (G, H), normal (G, H, 2) and offset (G, H) of the nearest surface of each cell."""
+    cells = np.round(points / spec.cell).astype(int)
+    point_at = np.full(size, -1)
+    point_at[tuple(cells.T)] = np.arange(len(points))
+    empty = point_at < 0
+    if empty.all():
+        return np.full(size, np.inf), np.zeros((*size, 2)), np.zeros(size)
+    distance, index = ndimage.distance_transform_edt(
+        empty, sampling=spec.cell, return_distances=True, return_indices=True
+    )
+    nearest = point_at[tuple(index)]
+    normal = normals[nearest]
+    return distance, normal, np.sum(normal * points[nearest], axis=-1)
+
+
+def _positions(
+    spec: PlaceSpec, path: np.ndarray, low: np.ndarray, distance: np.ndarray
+) -> np.ndarray:
+    """Positions (N, 2) [m] where a robot may stand: on the path (K, 2), and free ones beside it."""
+    steps = int(np.ceil(spec.position_offset / spec.position_spacing))
+    offsets = spec.position_spacing * np.arange(-steps, steps + 1)
+    beside = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1).reshape(-1, 2)
+    beside = beside[np.hypot(*beside.T) <= spec.position_offset]
+    cells = np.round(path / spec.position_spacing).astype(int)
+    around = spec.position_spacing * np.unique(cells, axis=0)[:, None] + beside[None]
+    around = np.unique(np.round(around.reshape(-1, 2), 6), axis=0)
+    index = np.round((around - low) / spec.cell).astype(int)
+    index = index.clip(0, np.array(distance.shape) - 1)
+    return around[distance[tuple(index.T)] >= spec.min_clearance]
+
+
+def _directions(
+    spec: PlaceSpec,
+    size: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    positions: np.ndarray,
+) -> np.ndarray:
+    """Histograms (N, B) of the directions of normals (M, 2) of points around positions (N, 2)."""
+    shape = *np.ceil(size / DIRECTION_CELL).astype(int) + 1, spec.direction_bins
+    counts = np.zeros(shape)
+    turn = np.arctan2(normals[:, 1], normals[:, 0]) / (2.0 * np.pi)
+    bins = np.round(turn * spec.direction_bins).astype(int) % spec.direction_bins
+    # A surface counts once, however often it was seen.
+    cells = np.unique(np.column_stack([np.round(points / spec.cell).astype(int), bins]), axis=0)
+    place = np.round(cells[:, :2] * spec.cell / DIRECTION_CELL).astype(int)
+    np.add.at(counts, (*place.T, cells[:, 2]), 1.0)
+    reach = int(np.ceil(spec.direction_radius / DIRECTION_CELL))
+    offsets = np.arange(-reach, reach + 1) * DIRECTION_CELL
+    disc = np.hypot(*np.meshgrid(offsets, offsets)) <= spec.direction_radius
+    counts = ndimage.convolve(counts, disc[..., None].astype(float), mode="constant")
+    at = np.round(positions / DIRECTION_CELL).astype(int)
+    found = counts[tuple(at.T)]
+    return found / np.maximum(found.sum(axis=1, keepdims=True), 1.0)

@@ -86,20 +86,22 @@ def search_widely(
     def candidates() -> Array:
         return _candidates(spec, surfaces, hypotheses, points, hit, quick)
 
-    # Begun where the wheels had the robot; then where the motion before has it; then the search.
-    num_found = 2 + spec.search.num_candidates
+    # Begun where the wheels had the robot; then where the motion before has it; then the search;
+    # then where it is if it drove backwards, which may be out of the window of the search.
+    num_found = 3 + spec.search.num_candidates
+    num_likely = num_found - (hypotheses.weights[2] == 0.0).astype(jnp.int32)
     found = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_found, *x.shape)), quick)
     values = jnp.full(num_found, -jnp.inf, quick.pose.dtype).at[0].set(value(quick) + spec.min_gain)
-    starts = jnp.broadcast_to(hypotheses.poses[1], (num_found, 3))
+    starts = jnp.broadcast_to(hypotheses.poses[1], (num_found, 3)).at[-1].set(hypotheses.poses[2])
 
     def is_left(state: _Refining) -> Array:
         settled = only_compare & (state.number == 2) & (state.values[0] >= state.values[1])
-        return (state.number < num_found) & ~settled
+        return (state.number < num_likely) & ~settled
 
     def body(state: _Refining) -> _Refining:
         number, starts, found, values = state
         starts = lax.cond(
-            number == 2, lambda starts: starts.at[2:].set(candidates()), lambda s: s, starts
+            number == 2, lambda starts: starts.at[2:-1].set(candidates()), lambda s: s, starts
         )
         match = refine(starts[number])
         found = jax.tree.map(lambda held, one: held.at[number].set(one), found, match)

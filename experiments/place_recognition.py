@@ -29,7 +29,7 @@ from jaxslam.core.time_series import match_times
 from jaxslam.evaluation.trajectory import align_trajectory
 from jaxslam.io.errors import InputError
 from jaxslam.matching.place_index import PlaceSpec, build_index
-from jaxslam.matching.place_recognition import find_places, make_query
+from jaxslam.matching.place_recognition import PlaceQuery, find_places, make_query
 from jaxslam.pipeline import log_input
 
 NAME = "place_recognition"
@@ -41,6 +41,7 @@ MARGINS = np.arange(0.0, 0.301, 0.01)
 MAX_KEYFRAMES = 1000  # of a log; each query has a map of its own
 SHARES = (0.125, 0.25, 0.5, 1.0)  # of the keyframes in the maps that time is taken with
 SPEC = PlaceSpec()
+_make_query = jax.jit(make_query, static_argnums=(0, 1))
 
 
 class Keyframes(NamedTuple):
@@ -75,9 +76,7 @@ def query_all(keyframes: Keyframes, protocol: str, every: int, bar: tqdm) -> lis
         if protocol == PROTOCOLS[1]:
             others = np.abs(driven - driven[number]) > MIN_PATH
         index = build_index(SPEC, lidar, poses[others], _take(scans, others))
-        query = jax.jit(make_query, static_argnums=(0, 1))(
-            SPEC, lidar, jax.tree.map(jnp.asarray, _take(scans, [number])), jnp.zeros((1, 3))
-        )
+        query = _query_of(lidar, scans, number)
         found = find_places(SPEC, index, query)
         rows.append(
             {
@@ -101,6 +100,11 @@ def _within(pose: np.ndarray, others: np.ndarray, limits: tuple[float, float]) -
 
 def _take(scans: Scan, chosen: np.ndarray | list[int]) -> Scan:
     return jax.tree.map(lambda x: x[chosen], scans)
+
+
+def _query_of(lidar: Lidar, scans: Scan, number: int) -> PlaceQuery:
+    scan = jax.tree.map(jnp.asarray, _take(scans, [number]))
+    return _make_query(SPEC, lidar, scan, jnp.zeros((1, 3)))
 
 
 def summary(rows: list[Numbers], margin: float = SPEC.min_margin) -> Numbers:
@@ -129,8 +133,7 @@ def timing(keyframes: Keyframes, repeats: int = 30) -> list[Numbers]:
         start = time.perf_counter()
         index = build_index(SPEC, keyframes.lidar, keyframes.poses[some], scans)
         built = time.perf_counter() - start
-        first = jax.tree.map(jnp.asarray, _take(scans, [0]))
-        query = make_query(SPEC, keyframes.lidar, first, jnp.zeros((1, 3)))
+        query = _query_of(keyframes.lidar, scans, 0)
         jax.block_until_ready(find_places(SPEC, index, query))
         times = []
         for _ in range(repeats):

@@ -50,9 +50,10 @@ def write_maps(
     params: NoiseParams,
     result: SlamResult,
     measurements: Measurement,
+    times: np.ndarray,
     scans: Scan,
 ) -> None:
-    """Write map.yaml, map.pgm, graph.g2o and, if networkx is installed, map.graphml.
+    """Write map.yaml, map.pgm, graph.g2o, map.npz and, if networkx is installed, map.graphml.
 
     Args:
         out_dir: Folder to write to.
@@ -60,6 +61,7 @@ def write_maps(
         params: Noise parameters of the filter.
         result: Result of SLAM.
         measurements: [K] inputs of the filter.
+        times: (K,) [s] of the keyframes.
         scans: [K] of the keyframes, which the occupancy grid is made of.
     """
     poses = result.poses[result.keyframes]
@@ -75,30 +77,10 @@ def write_maps(
         result.loop_closures,
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
-    if find_spec("networkx") is not None:
-        graphml.write(out_dir / "map.graphml", result.topological_map)
-
-
-def write_saved_map(
-    out_dir: Path,
-    config: Config,
-    params: NoiseParams,
-    result: SlamResult,
-    times: np.ndarray,
-    scans: Scan,
-) -> None:
-    """Write map.npz, the map for later sessions.
-
-    Args:
-        out_dir: Folder to write to.
-        config: Configuration of the run.
-        params: Noise parameters of the filter.
-        result: Result of SLAM.
-        times: (K,) [s] of the keyframes.
-        scans: [K] of the keyframes.
-    """
     saved_map = to_saved_map(config, params, result, times, scans)
     map_file.write(out_dir / map_file.NAME, saved_map)
+    if find_spec("networkx") is not None:
+        graphml.write(out_dir / "map.graphml", result.topological_map)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:

@@ -156,9 +156,8 @@ def run(
             filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)
         )
         of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
-        report.write_maps(out_dir, config, params, result, measurements, of_keyframes)
         times = laser_log.times[result.keyframes]
-        report.write_saved_map(out_dir, config, params, result, times, of_keyframes)
+        report.write_maps(out_dir, config, params, result, measurements, times, of_keyframes)
         trajectories, error = {"odometry": odom_poses}, None
         if known is not None:
             trajectories["reference"] = log_errors.reference_in_map(

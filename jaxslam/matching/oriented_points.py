@@ -96,6 +96,12 @@ def _neighbours(lidar: Lidar, scan: Scan, ends: Array) -> tuple[Array, Array, Ar
     return jnp.stack(neighbours), jnp.stack(on_surface).astype(ends.dtype), gap
 
 
+def towards_scanner(points: OrientedPoints) -> OrientedPoints:
+    """Oriented points of the robot frame, their normals turned to where they were seen from."""
+    away = dot(points.normal, points.points) > 0.0
+    return points._replace(normal=jnp.where(away[..., None], -points.normal, points.normal))
+
+
 def transform_points(pose: Array, points: OrientedPoints) -> OrientedPoints:
     """Oriented points of the frame of a pose (3,), in the frame that the pose is given in."""
     turn = rotation(pose[2])

@@ -23,7 +23,12 @@ from jaxslam.core.batching import pad_to
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.types import AnyArray, Array, as_float64
 from jaxslam.matching import checks
-from jaxslam.matching.oriented_points import OrientedPoints, oriented_points, transform_points
+from jaxslam.matching.oriented_points import (
+    OrientedPoints,
+    oriented_points,
+    towards_scanner,
+    transform_points,
+)
 
 MARGIN = 2.0
 """[m] of the grid around all that the keyframes saw."""
@@ -125,10 +130,9 @@ def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> 
         raise ValueError("poses are those of no keyframe, or not finite")
     surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(poses, float), scans))
     seen = surfaces.valid
-    points = surfaces.points[seen].astype(float)
-    normals = _towards(surfaces.normal[seen], points, np.repeat(poses[:, :2], seen.sum(1), axis=0))
-    low = np.min([*points, *poses[:, :2]], axis=0) - MARGIN
-    high = np.max([*points, *poses[:, :2]], axis=0) + MARGIN
+    points, normals = (x[seen].astype(float) for x in (surfaces.points, surfaces.normal))
+    everything = np.concatenate([points, poses[:, :2]])
+    low, high = everything.min(axis=0) - MARGIN, everything.max(axis=0) + MARGIN
     size = GRID_BLOCK * np.ceil((high - low) / spec.cell / GRID_BLOCK).astype(int)
     distance, normal, offset = _nearest_surfaces(spec, size, points - low, normals)
     positions = _positions(spec, poses[:, :2], low, distance)
@@ -168,15 +172,9 @@ def check_place_spec(spec: PlaceSpec) -> None:
 
 @partial(jax.jit, static_argnames="lidar")
 def _surfaces(lidar: Lidar, poses: Array, scans: Scan) -> OrientedPoints:
-    """Oriented points [K] of scans [K], in the frame of their poses (K, 3)."""
-    points = jax.vmap(partial(oriented_points, lidar))(scans)
+    """Oriented points [K] of scans [K] at poses (K, 3), normals to where they were seen from."""
+    points = towards_scanner(jax.vmap(partial(oriented_points, lidar))(scans))
     return jax.vmap(transform_points)(poses, points)
-
-
-def _towards(normals: np.ndarray, points: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Normals (N, 2) of surface points (N, 2), turned to where each was seen from (N, 2)."""
-    away = np.sum(normals * (positions - points), axis=1) < 0.0
-    return np.where(away[:, None], -normals, normals).astype(float)
 
 
 def _nearest_surfaces(

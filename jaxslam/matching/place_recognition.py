@@ -40,7 +40,7 @@ from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
 from jaxslam.matching.icp import solve
-from jaxslam.matching.oriented_points import oriented_points, transform_points
+from jaxslam.matching.oriented_points import oriented_points, towards_scanner, transform_points
 from jaxslam.matching.place_index import PlaceIndex, PlaceSpec, check_place_spec
 
 FREE_BEFORE = (0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
@@ -106,9 +106,7 @@ def make_query(spec: PlaceSpec, lidar: Lidar, scans: Scan, poses: AnyArray) -> P
     check_lidar(lidar)
     poses = checks.as_default_float("poses", poses, ("W", 3))
     scans = checks.as_scans("scans", lidar, scans, poses.shape[:1])
-    surfaces = jax.vmap(partial(oriented_points, lidar))(scans)
-    towards = jnp.sum(surfaces.normal * surfaces.points, axis=-1, keepdims=True) < 0.0
-    surfaces = surfaces._replace(normal=jnp.where(towards, surfaces.normal, -surfaces.normal))
+    surfaces = towards_scanner(jax.vmap(partial(oriented_points, lidar))(scans))
     ends = jax.vmap(partial(beam_ends, lidar))(scans)
     ranges = jnp.linalg.norm(ends, axis=-1, keepdims=True)
     share = 1.0 - jnp.array(FREE_BEFORE)[None, None] / jnp.maximum(ranges, 1e-3)
@@ -126,8 +124,9 @@ def make_query(spec: PlaceSpec, lidar: Lidar, scans: Scan, poses: AnyArray) -> P
     return PlaceQuery(points, normal, valid & few, free, is_free & few[:, None])
 
 
+@partial(trace_cache.jit, static_argnames=("spec",))
 def find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places:
-    """Places of a map that fit a query.
+    """Places of a map that fit a query; compiled.
 
     Under `jax.vmap` over queries, the index is shared.
 
@@ -136,12 +135,6 @@ def find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places
         index: Of the map.
         query: With `spec.max_points` points.
     """
-    return _find_places(spec, index, query)
-
-
-@partial(trace_cache.jit, static_argnames="spec")
-def _find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places:
-    """`find_places`, compiled."""
     every = -(-spec.max_points // spec.coarse_points)
     some = PlaceQuery(*(x[::every] for x in query))
 
@@ -193,9 +186,8 @@ def _best_turns(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Array:
     shift = jnp.arange(bins, dtype=jnp.int32)
     turned = counts[(shift[:, None] - shift[None]) % bins]  # (b, turn): by each turn
     agreement = (index.directions @ turned).reshape(-1, 4, bins // 4)
-    best = jnp.argmax(agreement, axis=-1).astype(jnp.int32) + jnp.arange(4, dtype=jnp.int32)[
-        None
-    ] * (bins // 4)
+    first = jnp.arange(4, dtype=jnp.int32) * (bins // 4)  # of each quadrant
+    best = first[None] + jnp.argmax(agreement, axis=-1).astype(jnp.int32)
     return best.astype(direction.dtype) * (2.0 * jnp.pi / bins)
 
 
@@ -210,9 +202,8 @@ def _refine(
         points = transform(pose, query.points)
         distance = _look_up(spec, index, points, index.distance)
         normal = _look_up(spec, index, points, index.normal)
-        error = dot(normal, points - index.origin[None]) - _look_up(
-            spec, index, points, index.offset
-        )
+        offset = _look_up(spec, index, points, index.offset)
+        error = dot(normal, points - index.origin[None]) - offset
         facing = dot(normal, query.normal @ rotation(pose[2]).T) > 0.5
         used = query.valid & facing & (distance < gate)
         weight = jnp.where(used, 1.0 / (1.0 + (error / gate) ** 2) ** 2, 0.0)

@@ -83,9 +83,6 @@ def search_widely(
         value = (match.inlier_fraction - contradicted) / 2 - unlikely
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
-    def candidates() -> Array:
-        return _candidates(spec, surfaces, hypotheses, points, hit, quick)
-
     # Begun where the wheels had the robot; then where the motion before has it; then the search;
     # then where it is if it drove backwards, which may be out of the window of the search.
     num_found = 3 + spec.search.num_candidates
@@ -101,7 +98,11 @@ def search_widely(
     def body(state: _Refining) -> _Refining:
         number, starts, found, values = state
         starts = lax.cond(
-            number == 2, lambda starts: starts.at[2:-1].set(candidates()), lambda s: s, starts
+            number == 2,
+            lambda: starts.at[2:-1].set(
+                _candidates(spec, surfaces, hypotheses, points, hit, quick)
+            ),
+            lambda: starts,
         )
         match = refine(starts[number])
         found = jax.tree.map(lambda held, one: held.at[number].set(one), found, match)

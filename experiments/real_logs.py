@@ -38,7 +38,7 @@ from jaxslam.filtering.config import confirmed, init
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
 from jaxslam.io.errors import InputError
-from jaxslam.pipeline import episodes, offline
+from jaxslam.pipeline import episodes, offline, smoothing_stage
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import SlamResult
 from jaxslam.tuning import fitting
@@ -157,7 +157,7 @@ def row(
     if odometry == "scan" and LANDMARKS[landmarks]:  # scan matching alone closes no loops
         ranges = jnp.asarray(log.laser_log.ranges, float)
         scans = jax.tree.map(np.asarray, lidar.to_scan(config.frontend.lidar, ranges))
-    poses, _, _ = offline.smooth_result(
+    poses, _, _ = smoothing_stage.smooth_result(
         config, params, jnp.zeros(3), measurements, info, belief, scans
     )
     numbers: common.Numbers = {"nees": None}

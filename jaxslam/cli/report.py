@@ -157,7 +157,9 @@ def draw(
     if scans is not None:
         points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
         maps.draw_hits(axis, poses[result.keyframes], np.asarray(points), np.asarray(scans.hit))
-    for what, line in (lines | {"estimate": poses}).items():
+    breaks = np.flatnonzero(np.diff(result.piece)) + 1  # across which no line is drawn
+    estimate = np.insert(poses, breaks, np.nan, axis=0)
+    for what, line in (lines | {"estimate": estimate}).items():
         maps.draw_trajectory(axis, line, what)
     maps.draw_wrong_parts(axis, poses, wrong)
     maps.draw_arcs(axis, result.topological_map)

@@ -3,13 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import report, summaries
+from jaxslam.cli import report, run_results, summaries
 from jaxslam.cli.options import (
     OptionalCount,
     OptionalFile,
@@ -24,12 +22,9 @@ from jaxslam.cli.options import (
     require_odometry,
     stopwatch,
 )
+from jaxslam.cli.run_results import RunContext
 from jaxslam.core.caches import enable_caches
-from jaxslam.core.logs import LaserLog, Relations
-from jaxslam.core.measurement import Measurement
-from jaxslam.core.se2_np import compose, relative
-from jaxslam.evaluation import log_errors, map_consistency
-from jaxslam.evaluation.log_errors import Trajectory
+from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
@@ -127,91 +122,37 @@ def run(
                 file = out_dir / "run.rrd" if rerun == "file" else None
                 viewer = RerunView(config, laser_log.times, scans, file)
             result = _run_slam(given, params, smooth=smooth, viewer=viewer)
-        numbers = {
-            "scans": len(result.poses),
-            "keyframes": len(result.keyframes),
+        context = RunContext(
+            laser_log,
+            given,
+            params,
+            known,
+            verified,
+            dead_reckoning,
+            smooth=smooth,
+            of_base=pose_frame == "base",
+            gif=gif,
+        )
+        folders = [f"part_{k + 2}" for k in range(len(result.other_parts))]
+        extra: Metrics = {
             "skipped_lines": laser_log.num_skipped,
             "mended": [*given.notes, *reference_notes, *result.notes],
             "odometry": given.odometry_source,
-            "path_length_m": log_errors.path_length(result.poses if match_scans else odom_poses),
-            "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
-            "matches": float(np.mean(np.sum(np.asarray(result.info.used), axis=1))),
-            "closures": len(result.loop_closures.first) if result.loop_closures else 0,
             "seconds": seconds,
         }
-        numbers |= _errors(laser_log, result, known, verified, smooth=smooth)
-        consistency = map_consistency.check_map(config.frontend.lidar, result.poses, scans)
-        numbers["map_consistency"] = consistency.metrics()
-        if dead_reckoning:
-            numbers["dead_reckoning"] = dead_reckoning
-        poses = result.poses
-        if pose_frame == "base":
-            base = relative(laser_log.mount, np.zeros(3))  # the robot in the frame of the scanner
-            poses = compose(np.asarray(result.poses, np.float64), base)
-        report.write_results(out_dir, numbers, laser_log.times, poses, result.topological_map)
-        measurements = Measurement(
-            jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
-        )
-        config = config._replace(  # the map has grown to its size, which the files are made for
-            filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)
-        )
-        of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
-        times = laser_log.times[result.keyframes]
-        report.write_maps(out_dir, config, params, result, measurements, times, of_keyframes)
-        trajectories, error = {"odometry": odom_poses}, None
-        if known is not None:
-            trajectories["reference"] = log_errors.reference_in_map(
-                laser_log.times, result.poses, known
-            )
-            if log_errors.has_heading(known):
-                error = _online_errors(laser_log, result, known)
-        wrong = [(warning.first_scan, warning.last_scan) for warning in consistency.warnings]
-        report.draw(out_dir, config, result, trajectories, error, scans=of_keyframes, wrong=wrong)
+        if folders:
+            extra["other_parts"] = folders
+        numbers, num_warnings = run_results.write(context, result, out_dir, extra)
+        for name, part in zip(folders, result.other_parts, strict=True):
+            (out_dir / name).mkdir()
+            about: Metrics = {"mended": list(part.notes), "odometry": given.odometry_source}
+            alone = context._replace(reference=None, relations=None, dead_reckoning={})
+            num_warnings += run_results.write(alone, part, out_dir / name, about)[1]
         if scan is not None:
             report.draw_scan(out_dir / "scan.png", config, scans, scan)
-        if gif:
-            from jaxslam.viz import animation  # imported here, because matplotlib is slow to import
-
-            animation.animate_run(
-                out_dir / "run.gif",
-                config,
-                params,
-                measurements,
-                of_keyframes,
-                result.poses[result.keyframes],
-                odom_poses[result.keyframes],
-            )
-    size = f"{len(result.poses)} scans, {len(result.keyframes)} keyframes"
+    size = f"{numbers['scans']} scans, {numbers['keyframes']} keyframes"
     summaries.print_summary(numbers, f"{size} of {log}", out)
-    return INCONSISTENT if strict and consistency.warnings else 0
-
-
-def _errors(
-    laser_log: LaserLog,
-    result: SlamResult,
-    reference: Trajectory | None,
-    relations: Relations | None,
-    *,
-    smooth: bool,
-) -> Metrics:
-    """Errors of the trajectory, and of the filter if it was smoothed; none without a reference."""
-    numbers: Metrics = {}
-    if reference is not None and log_errors.has_heading(reference):
-        error, cov = _online_errors(laser_log, result, reference), np.asarray(result.info.pose_cov)
-        numbers["nees"] = log_errors.mean_nees_per_dof(error, cov)
-    if reference is not None or relations is not None:
-        numbers |= log_errors.errors_against(laser_log, result.poses, reference, relations)
-        if smooth:
-            numbers["filter"] = log_errors.errors_against(
-                laser_log, result.online_poses, reference, relations
-            )
-    return numbers
-
-
-def _online_errors(laser_log: LaserLog, result: SlamResult, reference: Trajectory) -> np.ndarray:
-    """Errors (K, 3) [m, m, rad] of the online estimates of keyframes since the first scan."""
-    times, poses = laser_log.times, result.online_poses
-    return log_errors.errors_since_start(times, poses, reference)[result.keyframes]
+    return INCONSISTENT if strict and num_warnings else 0
 
 
 def _run_slam(

@@ -12,7 +12,8 @@ from jaxslam.core.se2_np import wrap_angle
 from jaxslam.core.types import as_float64, check_array
 from jaxslam.evaluation import map_warnings
 from jaxslam.evaluation.map_warnings import USUAL_CONTRADICTION, VISIT_SEPARATION, MapWarning
-from jaxslam.evaluation.scan_agreement import (
+from jaxslam.evaluation.summary import Metrics
+from jaxslam.matching.scan_agreement import (
     CONFIRMED,
     CONTRADICTED,
     HIDDEN,
@@ -21,7 +22,6 @@ from jaxslam.evaluation.scan_agreement import (
     ScanComparison,
     posed_scans,
 )
-from jaxslam.evaluation.summary import Metrics
 
 NUM_NEIGHBOURS = 3  # scans on either side of a step that are compared across it
 VISIT_RADIUS = 4.0  # [m] between scans of two visits to one place
@@ -79,7 +79,9 @@ class MapConsistency(NamedTuple):
         }
 
 
-def check_map(lidar: Lidar, poses: ArrayLike, scans: Scan) -> MapConsistency:
+def check_map(
+    lidar: Lidar, poses: ArrayLike, scans: Scan, *, piece: ArrayLike | None = None
+) -> MapConsistency:
     """Compare each scan with its neighbours in time and with other visits to the same place.
 
     No reference is needed. Two scans contradict each other where a beam of one ends in what the
@@ -98,6 +100,8 @@ def check_map(lidar: Lidar, poses: ArrayLike, scans: Scan) -> MapConsistency:
         poses: (T, 3) [m, m, rad] of the scanner in the order of time, map frame; those that are not
             finite are left out.
         scans: [T].
+        piece: (T,) int piece of a broken drive that each scan is in, as `SlamResult.piece`: across
+            a break, neighbours show different places. None for one drive.
 
     Raises:
         ValueError: The scanner is impossible, no pose is finite, or shapes do not fit.
@@ -110,6 +114,8 @@ def check_map(lidar: Lidar, poses: ArrayLike, scans: Scan) -> MapConsistency:
     shape = len(poses), lidar.num_beams
     ranges, hit = as_float64("scans.ranges", scans.ranges, shape), np.asarray(scans.hit)
     check_array("scans.hit", hit, shape, jnp.bool_)
+    piece = np.zeros(len(poses), int) if piece is None else np.asarray(piece)
+    check_array("piece", piece, (len(poses),), jnp.integer)
     finite = np.flatnonzero(np.isfinite(poses).all(axis=1))
     if not finite.size:
         raise ValueError("poses: no pose is finite")
@@ -118,6 +124,8 @@ def check_map(lidar: Lidar, poses: ArrayLike, scans: Scan) -> MapConsistency:
     comparison, num_scans = ScanComparison(posed), len(posed.number)
     steps, visits = _neighbours(num_scans), _earlier_visits(posed)
     by_step, by_visit = comparison.compare(*steps.T), comparison.compare(*visits.T)
+    of_scan = piece[posed.number]
+    by_step = by_step.of_pairs(of_scan[steps[:, 0]] == of_scan[steps[:, 1]])
     before, after = _lasting(steps, by_step, num_scans)
     step_contradiction, step_confirmation = _across_steps(steps, by_step, before, after)
     lasting = before | after

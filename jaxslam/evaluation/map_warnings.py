@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.evaluation.scan_agreement import CONTRADICTED, Agreement, PosedScans
+from jaxslam.matching.scan_agreement import CONTRADICTED, Agreement, PosedScans
 
 BROKEN_CONTRADICTION = 0.32  # of a step; people who walk about make less
 BROKEN_CONFIRMATION = 0.08  # of a step, of what is in view; less is another place

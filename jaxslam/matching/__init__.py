@@ -3,8 +3,12 @@
 from jaxslam.core.measurement import ScanMatch as ScanMatch
 from jaxslam.matching.icp import ScanMatchSpec as ScanMatchSpec
 from jaxslam.matching.icp import Submap as Submap
+from jaxslam.matching.joining import Join as Join
+from jaxslam.matching.joining import find_join as find_join
 from jaxslam.matching.loop_closure import LoopClosures as LoopClosures
 from jaxslam.matching.loop_closure import find_loop_closures as find_loop_closures
+from jaxslam.matching.map_places import JoinSpec as JoinSpec
+from jaxslam.matching.map_places import ScanMap as ScanMap
 from jaxslam.matching.odometry_fusion import fuse_odometry as fuse_odometry
 from jaxslam.matching.place_index import PlaceIndex as PlaceIndex
 from jaxslam.matching.place_index import PlaceSpec as PlaceSpec

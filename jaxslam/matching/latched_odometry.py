@@ -30,7 +30,9 @@ MIN_CHANGED = 0.3
 """Fraction of the beams that changes where a robot moves; less where only people do."""
 
 
-def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.ndarray, int]:
+def share_out_leaps(
+    odometry: np.ndarray, scans: Scan, unknown: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Share out the leaps of latched odometry over the scans before them.
 
     A leap is an increment after up to `MAX_LATCHED` increments of no motion at all, if its share is
@@ -40,6 +42,8 @@ def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.n
     Args:
         odometry: (T, 3) [m, m, rad] increments.
         scans: [T], NumPy.
+        unknown: (T,) bool, before which scans the robot may have been carried: no leap makes up for
+            that; none by default.
 
     Returns:
         Increments (T, 3) with the same poses after each leap; (T,) bool, which of them are shares
@@ -51,7 +55,8 @@ def share_out_leaps(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.n
     for at, leap in enumerate(moving):
         first = moving[at - 1] + 1 if at else 1
         count = leap - first + 1
-        if not 2 <= count <= MAX_LATCHED + 1:
+        carried = unknown is not None and unknown[first : leap + 1].any()
+        if carried or not 2 <= count <= MAX_LATCHED + 1:
             continue
         around = moving[max(at - NEIGHBOURS, 0) : at] + moving[at + 1 : at + 1 + NEIGHBOURS]
         usual = np.median(size[around]) if around else np.inf

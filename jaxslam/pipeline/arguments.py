@@ -76,15 +76,20 @@ def as_log_odometry(odometry: Any, *, name: str = "odometry") -> np.ndarray:
     return increments
 
 
-def as_guessed(guessed: Any, num_scans: int) -> np.ndarray:
-    """Which increments of the odometry are guesses, (T,) bool; none where None is given.
+def as_flags(name: str, flags: Any, num_scans: int) -> np.ndarray:
+    """What is said of each scan, (T,) bool; of none where None is given.
+
+    Args:
+        name: Name of the argument, for the message.
+        flags: Bools, or None.
+        num_scans: T.
 
     Raises:
         ValueError: They are no bools, or not as many as scans.
     """
-    if guessed is None:
+    if flags is None:
         return np.zeros(num_scans, bool)
-    return np.array(as_bool("odometry_guessed", guessed, (num_scans,)))
+    return np.array(as_bool(name, flags, (num_scans,)))
 
 
 def as_scans(lidar: Lidar, ranges: Any, num_scans: int) -> Scan:

@@ -11,6 +11,7 @@ from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import field_of_view
 from jaxslam.matching.checks import check_scan_match_spec
 from jaxslam.matching.icp import ScanMatchSpec
+from jaxslam.matching.map_places import JoinSpec, check_join_spec
 from jaxslam.matching.registration import LoopClosureSpec, check_loop_closure_spec
 from jaxslam.pipeline import keyframes
 
@@ -18,7 +19,7 @@ MAX_LANDMARKS = 2048  # default capacity for landmarks: a building with some kil
 LOG_CONFIRM_COUNT = 3  # real buildings have clutter that looks like a landmark once or twice
 LOG_KEYFRAME_DISTANCE = (0.3, 0.3)  # [m], [rad] little of a scanner's view changes over it
 FRONTEND, FILTER = FrontendConfig(), FilterConfig()  # the defaults
-SCAN_MATCHING, LOOP_CLOSURE = ScanMatchSpec(), LoopClosureSpec()
+SCAN_MATCHING, LOOP_CLOSURE, JOINING = ScanMatchSpec(), LoopClosureSpec(), JoinSpec()
 
 
 class Config(NamedTuple):
@@ -34,6 +35,7 @@ class Config(NamedTuple):
         keyframe_distance: [m], [rad] matched motion since the last keyframe that makes a scan of a
             log a keyframe, if it exceeds one of both; other scans are only matched. None: every
             scan is a keyframe, as where more than half of them would be.
+        joining: How pieces of a broken drive are joined.
     """
 
     frontend: FrontendConfig = FRONTEND
@@ -41,6 +43,7 @@ class Config(NamedTuple):
     scan_matching: ScanMatchSpec = SCAN_MATCHING
     loop_closure: LoopClosureSpec = LOOP_CLOSURE
     keyframe_distance: tuple[float, float] | None = None
+    joining: JoinSpec = JOINING
 
     @classmethod
     def for_lidar(
@@ -118,6 +121,7 @@ class Config(NamedTuple):
         filter_config.check_config(self.filter)
         check_scan_match_spec(self.scan_matching, "config.scan_matching")
         check_loop_closure_spec(self.loop_closure)
+        check_join_spec(self.joining)
         keyframes.check_distance(self.keyframe_distance)
         own, scanner = self.filter.field_of_view, field_of_view(self.frontend.lidar)
         if own != scanner:

@@ -11,7 +11,7 @@ from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import increments, relative
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
-from jaxslam.pipeline import arguments, offline
+from jaxslam.pipeline import arguments, breaks, offline
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import SlamResult
@@ -31,6 +31,7 @@ class LogInput(NamedTuple):
         odom_poses: (T, 3) [m, m, rad] poses by odometry since the first scan, the map frame.
         increments: (T, 3) [m, m, rad] odometry increments, zero at the first scan.
         guessed: (T,) bool, which of them are guesses of the reader; None for none.
+        after_pause: (T,) bool, before which scans the robot may have been moved unseen.
         scans: [T].
         notes: What was wrong with the log, or had to be assumed.
     """
@@ -40,6 +41,7 @@ class LogInput(NamedTuple):
     odom_poses: np.ndarray
     increments: np.ndarray
     guessed: np.ndarray | None
+    after_pause: np.ndarray
     scans: Scan
     notes: tuple[str, ...]
 
@@ -73,7 +75,8 @@ def from_laser_log(laser_log: LaserLog, source: OdometrySource = "scan") -> LogI
     scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
     arguments.as_scans(config.frontend.lidar, laser_log.ranges, len(odometry))
     guessed = laser_log.odometry_guessed
-    return LogInput(config, source, odom_poses, odometry, guessed, scans, notes)
+    after_pause = breaks.pauses(laser_log.times)
+    return LogInput(config, source, odom_poses, odometry, guessed, after_pause, scans, notes)
 
 
 def run(
@@ -97,6 +100,7 @@ def run(
         log.increments,
         log.scans,
         odometry_guessed=log.guessed,
+        after_pause=log.after_pause,
         match_scans=log.match_scans,
         smooth=smooth,
         callback=callback,

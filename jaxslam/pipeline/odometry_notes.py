@@ -12,9 +12,11 @@ MIN_MIRRORED = 5  # scans from which on such wheels are noted
 MIN_CONTRADICTED = 0.01  # fraction of the scans from which contradictions are noted
 
 
-def share_out(odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+def share_out(
+    odometry: np.ndarray, scans: Scan, unknown: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Odometry (T, 3) whose leaps are shared out, its shares (T,), and a note if there are any."""
-    odometry, is_share, num_leaps = share_out_leaps(odometry, scans)
+    odometry, is_share, num_leaps = share_out_leaps(odometry, scans, unknown)
     note = f"{num_leaps} leaps after latched poses shared out over the scans before"
     return odometry, is_share, (note,) if num_leaps else ()
 

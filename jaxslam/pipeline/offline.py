@@ -1,50 +1,40 @@
 """SLAM on a whole log: chunks of keyframes, then batch smoothing with loop closures."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core import trace_cache
-from jaxslam.core.batching import pad_to
 from jaxslam.core.features import Features
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.measurement import Measurement, ScanMatch
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import Array
+from jaxslam.core.se2_np import compose, relative
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.mapping.arc_table import ArcTable
-from jaxslam.matching import loop_closure
 from jaxslam.matching.loop_closure import LoopClosures
-from jaxslam.pipeline import arguments, keyframes, odometry_notes, online, stages
+from jaxslam.matching.map_places import ScanMap
+from jaxslam.pipeline import arguments, keyframes, odometry_notes, online, pieces, stages
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.online import SlamState
-from jaxslam.smoothing import numbering, sparse
-from jaxslam.smoothing import problem as smoothing_problem
-from jaxslam.smoothing.problem import SmoothingProblem, SmoothingResult
+from jaxslam.pipeline.pieces import Group
+from jaxslam.pipeline.smoothing_stage import smooth_result
+from jaxslam.pipeline.stages import Drive, KeyframeChunk
 
-# Searches for loop closures at most, each from the trajectory smoothed before it.
-MAX_CLOSURE_ROUNDS = 2
-CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further than this
-# Numbers of scans and landmarks are padded to multiples of this to be smoothed.
-PADDING_MULTIPLE = 512
-
-_build_problem = trace_cache.jit(
-    smoothing_problem.build_problem, static_argnames="untrusted_inflation"
-)
+Callback = Callable[[SlamState, ChunkResult], Any]
 
 
 class SlamResult(NamedTuple):
     """Result of SLAM on a log of T scans, K of which are keyframes.
 
     Attributes:
-        poses: (T, 3) float64 [m, m, rad] estimated trajectory, map frame: filtered, or smoothed.
+        poses: (T, 3) float64 [m, m, rad] estimated trajectory, map frame: filtered, or smoothed;
+            NaN for scans that are in none of its pieces.
         online_poses: (T, 3) float64 [m, m, rad] estimates at the time: those of the filter, and
             between keyframes the matched motion since.
         keyframes: (K,) int numbers of the keyframes, which the filter was given; the first and the
@@ -62,6 +52,10 @@ class SlamResult(NamedTuple):
             repaired, or zero where odometry is not used.
         notes: What was wrong with the odometry, to be printed.
         arcs: Arcs that the topological map is made of, as observed; to go on from.
+        piece: (T,) int piece of the drive that each scan is in, from 0; -1 for scans that are not
+            in this map.
+        other_parts: Maps of the pieces that nothing joins to this one, each in a frame of its own,
+            the largest first.
     """
 
     poses: np.ndarray
@@ -76,6 +70,8 @@ class SlamResult(NamedTuple):
     odometry: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     arcs: ArcTable | None = None
+    piece: np.ndarray = np.zeros(0, int)
+    other_parts: "tuple[SlamResult, ...]" = ()
 
 
 def run_slam(
@@ -86,9 +82,11 @@ def run_slam(
     *,
     start: Any = None,
     odometry_guessed: Any = None,
+    after_pause: Any = None,
+    new_drive: Any = None,
     match_scans: bool = True,
     smooth: bool = True,
-    callback: Callable[[SlamState, ChunkResult], Any] | None = None,
+    callback: Callback | None = None,
 ) -> SlamResult:
     """Run SLAM on a whole log.
 
@@ -102,6 +100,10 @@ def run_slam(
     matched, loops are closed by matching scans of later visits with those of earlier ones
     (`loop_closure.find_loop_closures`).
 
+    Where the robot was moved from one scan to the next (`breaks`), the pieces of the drive are
+    mapped on their own, and joined where places are found again (`pieces`). The result is the
+    largest map; what nothing joins to it is in `other_parts`.
+
     Args:
         config: For the scanner, as `Config.for_laser_log` makes it; `config.filter.max_landmarks`
             is the largest size of the map.
@@ -113,6 +115,10 @@ def run_slam(
         start: (3,) [m, m, rad] first pose, map frame; zero by default.
         odometry_guessed: (T,) bool, which increments of the odometry are guesses of whoever read
             the log, not what the wheels said (`LaserLog.odometry_guessed`); none by default.
+        after_pause: (T,) bool, before which scans the robot may have been moved unseen, as
+            `breaks.pauses` finds them by time; none by default. Only such as contradict the wheels,
+            or fit the scans before badly, are breaks.
+        new_drive: (T,) bool, which scans begin another drive, at an unknown place; none by default.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
         callback: Called after each chunk of keyframes with the state and the result of the chunk;
@@ -120,7 +126,8 @@ def run_slam(
 
     Raises:
         ValueError: An argument has another shape, or does not fit the others; the odometry holds
-            poses; or scans are matched and `params.scan_match_std_scale` is None.
+            poses; scans are matched and `params.scan_match_std_scale` is None; or they are not, and
+            there are several drives.
     """
     arguments.check_config(config)
     params = arguments.as_params(params, match_scans=match_scans)
@@ -129,43 +136,159 @@ def run_slam(
     scans = arguments.as_scans(config.frontend.lidar, ranges, len(increments))
     pose = arguments.as_start(start)
     notes: tuple[str, ...] = ()
-    guessed = arguments.as_guessed(odometry_guessed, len(increments))
+    count = len(increments)
+    guessed = arguments.as_flags("odometry_guessed", odometry_guessed, count)
+    after_pause = arguments.as_flags("after_pause", after_pause, count)
+    new_drive = arguments.as_flags("new_drive", new_drive, count)
+    if new_drive[1:].any() and not match_scans:
+        raise ValueError("new_drive: drives are joined by their scans; take match_scans=True")
     if match_scans and config.scan_matching.use_odometry:
-        increments, is_share, notes = odometry_notes.share_out(increments, scans)
+        unknown = after_pause | new_drive
+        increments, is_share, notes = odometry_notes.share_out(increments, scans, unknown)
         guessed |= is_share
     elif match_scans:
         increments = np.zeros_like(increments)
     distance = keyframes.distance_for_log(config.keyframe_distance, increments)
     config = config._replace(keyframe_distance=distance)
-    state, parts = online.init(config, pose, match_scans=match_scans), []
-    log = stages.keyframe_chunks(config, state.submap, increments, scans, guessed)
-    odometry_parts, matched_parts = [], []
+    run = _Run(config, params, scans, match_scans, smooth, callback)
+    state = online.init(config, pose, match_scans=match_scans)
+    drive = Drive(increments, scans, guessed, after_pause, new_drive)
+    log = stages.keyframe_chunks(config, state.submap, drive)
     with closing(log):  # whatever happens, no scans are matched any more after it
-        following = next(log, None)
-        while following is not None:
-            now, following = following, next(log, None)  # in the background of the filter
-            state, part = online.advance(config, params, state, now.chunk)
-            odometry_parts.append(now.odometry)
-            matched_parts.append(now.matched)
-            parts.append(part._replace(keyframes=now.keyframes))
-            if callback is not None:
-                callback(state, parts[-1])
-    info, features, matches, numbers = stages.concatenate(parts)
-    keyframe_odometry, matched = np.concatenate(odometry_parts), stages.concatenate(matched_parts)
+        first, later = _first_piece(run, state, pose, log)
+    results = [_result(run, first)] if not later else _several_pieces(run, first, later)
+    results.sort(key=lambda result: -np.count_nonzero(result.piece >= 0))
+    main, *others = results
+    for part in others:
+        scans_of_part = np.flatnonzero(part.piece >= 0)
+        notes += (
+            f"scans {scans_of_part[0]}-{scans_of_part[-1]} follow or precede a break of the drive, "
+            "and no place joins them to the rest: they are a map of their own",
+        )
+    return main._replace(notes=notes + main.notes, other_parts=tuple(others))
+
+
+class _Run(NamedTuple):
+    """What all stages of a run need: arguments of `run_slam`, checked."""
+
+    config: Config
+    params: NoiseParams
+    scans: Scan
+    match_scans: bool
+    smooth: bool
+    callback: Callback | None
+
+
+class _Filtered(NamedTuple):
+    """Keyframes that the filter was given: its start, its state after them, and its results."""
+
+    start: Any
+    state: SlamState
+    chunks: tuple[KeyframeChunk, ...] = ()
+    results: tuple[ChunkResult, ...] = ()
+
+
+def _first_piece(
+    run: _Run, state: SlamState, start: Any, log: Iterable[KeyframeChunk]
+) -> tuple[_Filtered, list[KeyframeChunk]]:
+    """Filter the first piece of a log while its next scans are matched; and the chunks after it."""
+    filtered, chunks = _Filtered(start, state), iter(log)
+    following = next(chunks, None)
+    while following is not None and following.piece == 0:
+        now, following = following, next(chunks, None)  # in the background of the filter
+        filtered = _filter(run, filtered, [now])
+    return filtered, [] if following is None else [following, *chunks]
+
+
+def _filter(run: _Run, filtered: _Filtered, chunks: Sequence[KeyframeChunk]) -> _Filtered:
+    """Give chunks of keyframes to the filter."""
+    for now in chunks:
+        state, result = online.advance(run.config, run.params, filtered.state, now.chunk)
+        result = result._replace(keyframes=now.keyframes)
+        if run.callback is not None:
+            run.callback(state, result)
+        filtered = filtered._replace(
+            state=state, chunks=(*filtered.chunks, now), results=(*filtered.results, result)
+        )
+    return filtered
+
+
+def _several_pieces(
+    run: _Run, first: _Filtered, later: Sequence[KeyframeChunk]
+) -> list[SlamResult]:
+    """Results of the groups of pieces that can be joined."""
+    quiet = run._replace(callback=None)
+    alone = [first]
+    for chunk in later:
+        if chunk.piece == len(alone):
+            start = arguments.as_start(None)
+            alone.append(_Filtered(start, online.init(run.config, start)))
+        alone[chunk.piece] = _filter(quiet, alone[chunk.piece], [chunk])
+    found = [_result(run, piece) for piece in alone]
+    groups = pieces.group_pieces(run.config.joining, [_scan_map(run, one) for one in found])
+    results = []
+    for group in groups:
+        if len(group.pieces) == 1:
+            number = group.pieces[0]
+            if number > 0 and run.callback is not None:
+                run.callback(alone[number].state, alone[number].results[-1])
+            results.append(found[number])
+            continue
+        filtered = alone[group.pieces[0]]
+        own = [compose(frame, _scan_map(run, found[k]).poses) for k, frame in group.frames.items()]
+        for before, after, number in zip(own, own[1:], group.pieces[1:], strict=False):
+            chunks = alone[number].chunks
+            gap = relative(before[-1], after[0])
+            filtered = _filter(run, filtered, [pieces.after_gap(chunks[0], gap), *chunks[1:]])
+        results.append(_result(run, filtered, np.concatenate(own), _notes(group, alone)))
+    return results
+
+
+def _scan_map(run: _Run, result: SlamResult) -> ScanMap:
+    """The keyframes of a result."""
+    scans = jax.tree.map(lambda x: x[result.keyframes], run.scans)
+    return ScanMap(run.config.frontend.lidar, result.poses[result.keyframes], scans)
+
+
+def _notes(group: Group, alone: Sequence[_Filtered]) -> tuple[str, ...]:
+    """A note of what the pieces of a group are, and of how they were joined."""
+    spans = [
+        f"{alone[k].chunks[0].keyframes[0]}-{alone[k].chunks[-1].keyframes[-1]}"
+        for k in group.pieces
+    ]
+    places = min(join.num_places for join in group.joins)
+    return (
+        f"the drive is broken: scans {' and '.join(spans)} were mapped on their own, and joined by "
+        f"{places} places that were found again",
+    )
+
+
+def _result(
+    run: _Run,
+    filtered: _Filtered,
+    guess: np.ndarray | None = None,
+    notes: tuple[str, ...] = (),
+) -> SlamResult:
+    """The result of keyframes that were filtered, smoothed if that is asked for."""
+    state, config = filtered.state, run.config
+    info, features, matches, numbers = stages.concatenate(list(filtered.results))
+    keyframe_odometry = np.concatenate([chunk.odometry for chunk in filtered.chunks])
+    matched = stages.concatenate([chunk.matched for chunk in filtered.chunks])
     motion = keyframes.motion_since_keyframe(matched.increments, matched.is_keyframe)
     keyframe_poses, closures = np.asarray(info.pose, np.float64), None
     online_poses = keyframes.poses_since_keyframes(keyframe_poses, matched.is_keyframe, motion)
     poses = online_poses
-    if smooth:
+    if run.smooth:
         own: Any = keyframe_odometry.astype(info.pose.dtype)  # NumPy, like the rest
         keyframe_poses, belief, closures = smooth_result(
             config,
-            params,
-            pose,
+            run.params,
+            filtered.start,
             Measurement(own, features, scan_match=matches),
             info,
             state.belief,
-            jax.tree.map(lambda x: x[numbers], scans) if match_scans else None,
+            jax.tree.map(lambda x: x[numbers], run.scans) if run.match_scans else None,
+            guess,
         )
         state = state._replace(belief=belief)
         poses = keyframes.interpolate_poses(
@@ -176,9 +299,10 @@ def run_slam(
         notes += odometry_notes.contradictions(matched.matches)
         notes += odometry_notes.unsigned(matched.matches, matched.odometry)
         notes += odometry_notes.wrong_scale(matched.matches, matched.odometry)
+    piece = _piece_of(filtered.chunks, len(run.scans.hit))
     return SlamResult(
-        poses,
-        online_poses,
+        _spread(poses, piece >= 0),
+        _spread(online_poses, piece >= 0),
         numbers,
         state.belief,
         info,
@@ -189,150 +313,21 @@ def run_slam(
         keyframe_odometry,
         notes,
         state.arcs,
+        piece,
     )
 
 
-def smooth_result(
-    config: Config,
-    params: NoiseParams,
-    start: Array,
-    measurements: Measurement,
-    info: StepInfo,
-    belief: Belief,
-    scans: Scan | None = None,
-) -> tuple[np.ndarray, Belief, LoopClosures | None]:
-    """Smooth a filtered trajectory by all its measurements.
-
-        smooth with the filter's data association
-        up to `MAX_CLOSURE_ROUNDS` times:
-            find loop closures from the smoothed trajectory, smooth again with them
-            stop if no pose has moved by `CLOSURE_CONVERGED` or more
-
-    Args:
-        config: Of the filter, of scan matching and of loop closures.
-        params: Q and R of the filter.
-        start: (3,) [m, m, rad] first pose, map frame.
-        measurements: [T] measurements of the filter, NumPy.
-        info: [T] its diagnostics, NumPy.
-        belief: After the last scan.
-        scans: [T] to find loop closures with, NumPy; None for none but the filter's own.
-
-    Returns:
-        Poses (T, 3) float64; the belief with the smoothed last pose and landmark positions, and the
-        covariance of the filter; and the loop closures, None without scans.
-
-    Raises:
-        ValueError: There are scans, and `params.scan_match_std_scale` is None.
-    """
-    params = arguments.as_params(params, match_scans=scans is not None)
-    steps = len(info.pose)
-    capacity = _padded(int(np.count_nonzero(np.unique(info.id) >= 0)))
-    numbered = numbering.number_landmarks(
-        info.id, info.pose, measurements.features, capacity=capacity
-    )
-    problem, guess = _padded_problem(
-        config.filter.untrusted_inflation,
-        params,
-        start,
-        measurements,
-        numbered.landmark_index,
-        np.asarray(info.pose),
-    )
-    smoothed = sparse.smooth_log(problem, guess, numbered.positions)
-    closures = None
-    std_scale = params.scan_match_std_scale
-    if scans is not None and std_scale is not None:
-        smoothed, closures = _close_loops(
-            config, problem, smoothed, scans, num_scans=steps, std_scale=float(std_scale)
-        )
-    poses, positions = map(np.asarray, (smoothed.poses[:steps], smoothed.landmark_positions))
-    positions = _positions_of(belief, np.asarray(numbered.id), positions)
-    mean = np.concatenate([poses[-1], positions.ravel()])
-    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype)), closures
+def _piece_of(chunks: Sequence[KeyframeChunk], num_scans: int) -> np.ndarray:
+    """Piece (T,) of each scan; -1 for those of no chunk."""
+    piece = np.full(num_scans, -1)
+    for chunk in chunks:
+        end = int(chunk.keyframes[-1]) + 1
+        piece[end - len(chunk.matched.is_keyframe) : end] = chunk.piece
+    return piece
 
 
-def _close_loops(
-    config: Config,
-    problem: SmoothingProblem,
-    smoothed: SmoothingResult,
-    scans: Scan,
-    *,
-    num_scans: int,
-    std_scale: float,
-) -> tuple[SmoothingResult, LoopClosures]:
-    """Smooth with loop closures that are found from the smoothed trajectory, until it is at rest.
-
-    Args:
-        config: Of scan matching and of loop closures.
-        problem: Padded.
-        smoothed: Without loop closures.
-        scans: [T].
-        num_scans: T.
-        std_scale: Factor on the standard deviation of scan matching.
-    """
-    for _ in range(MAX_CLOSURE_ROUNDS):
-        before = smoothed
-        closures = loop_closure.find_loop_closures(
-            config.loop_closure,
-            config.scan_matching,
-            config.frontend.lidar,
-            before.poses[:num_scans],
-            scans,
-            std_scale=std_scale,
-        )
-        smoothed = sparse.smooth_log(
-            problem, before.poses, before.landmark_positions, loop_closures=closures
-        )
-        if np.max(np.abs(smoothed.poses - before.poses)[:, :2]) < CLOSURE_CONVERGED:
-            break
-    return smoothed, closures
-
-
-def _padded(count: int) -> int:
-    """The next larger multiple of `PADDING_MULTIPLE`."""
-    return (count // PADDING_MULTIPLE + 1) * PADDING_MULTIPLE
-
-
-def _padded_problem(
-    untrusted_inflation: float,
-    params: NoiseParams,
-    start: Array,
-    measurements: Measurement,
-    landmark_index: Array,
-    poses: np.ndarray,
-) -> tuple[SmoothingProblem, np.ndarray]:
-    """Smoothing problem and guess (P, 3), padded by steps without motion and measurements.
-
-    Args:
-        untrusted_inflation: Of the filter's configuration.
-        params: Q and R of the filter.
-        start: (3,) first pose.
-        measurements: [T].
-        landmark_index: (T, M) landmark of each feature.
-        poses: (T, 3) guess.
-    """
-    steps = len(poses)
-    given = measurements, np.asarray(landmark_index), poses
-    measurements, index, guess = pad_to(given, to=_padded(steps))
-    index[steps:] = -1
-    measurements.odometry[steps:] = 0.0
-    if measurements.scan_match is not None:
-        measurements.scan_match.increment[steps:] = 0.0
-    problem = _build_problem(
-        params, start, measurements, index, untrusted_inflation=untrusted_inflation
-    )
-    return problem, guess
-
-
-def _positions_of(belief: Belief, ids: np.ndarray, smoothed_positions: np.ndarray) -> np.ndarray:
-    """Positions (L, 2) of the slots of a belief: smoothed where the landmark was, else as they are.
-
-    Args:
-        belief: The belief.
-        ids: (S,) ids of the smoothed landmarks, ascending; then at least one -1, the padding.
-        smoothed_positions: (S, 2).
-    """
-    ids = np.where(ids < 0, np.iinfo(ids.dtype).max, ids)  # sorts last, and is no landmark's id
-    index = np.searchsorted(ids, belief.id)
-    is_smoothed = (np.asarray(belief.num_seen) > 0) & (ids[index] == np.asarray(belief.id))
-    return np.where(is_smoothed[:, None], smoothed_positions[index], belief.landmark_positions)
+def _spread(poses: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Poses (N, 3) of the scans that are one's own (T,), as rows of all (T, 3); NaN elsewhere."""
+    spread = np.full((len(own), 3), np.nan)
+    spread[own] = poses
+    return spread

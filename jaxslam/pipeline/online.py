@@ -155,7 +155,7 @@ def match_log(
     increments = arguments.as_log_odometry(odometry)
     lidar, spec = config.frontend.lidar, config.scan_matching
     scans = arguments.as_scans(lidar, ranges, len(increments))
-    guessed = arguments.as_guessed(odometry_guessed, len(increments))
+    guessed = arguments.as_flags("odometry_guessed", odometry_guessed, len(increments))
     submap, parts = scan_matching.empty_submap(spec, lidar), []
     for first in range(0, len(increments), chunks.CHUNK):
         some = chunks.chunk_at(first, increments, scans)

@@ -10,6 +10,9 @@ scans are between two keyframes.
     front end                              | features 0 |            | features 1 |
     filter                                                           | filter 0   | filter 1 | ...
 
+Where the drive is broken (`breaks`), matching begins again with an empty submap, and the keyframes
+after it are those of another piece, in chunks of their own.
+
 Scan matching needs neither features nor filter: a worker thread matches scan after scan, while the
 main thread waits only for keyframes and for the results of the filter.
 """
@@ -25,7 +28,7 @@ import numpy as np
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Scan
 from jaxslam.matching.icp import Submap
-from jaxslam.pipeline import chunks, keyframes
+from jaxslam.pipeline import breaks, chunks, keyframes
 from jaxslam.pipeline.chunks import Chunk
 from jaxslam.pipeline.config import Config
 
@@ -57,53 +60,82 @@ class KeyframeChunk(NamedTuple):
         keyframes: (N,) int number of each in the log.
         odometry: (N, 3) [m, m, rad] increments by the wheels from keyframe to keyframe.
         matched: [S] all scans after the last keyframe of the chunk before, up to the last of this.
+        piece: Number of the piece of the drive that they belong to, from 0.
     """
 
     chunk: Chunk
     keyframes: np.ndarray
     odometry: np.ndarray
     matched: MatchedScans
+    piece: int = 0
+
+
+class Drive(NamedTuple):
+    """What is matched: T scans with odometry, NumPy.
+
+    Attributes:
+        odometry: (T, 3) [m, m, rad] increments.
+        scans: [T].
+        guessed: (T,) bool, which increments are guesses of the reader.
+        after_pause: (T,) bool, before which scans the robot may have been moved unseen.
+        new_drive: (T,) bool, before which scans it surely was.
+    """
+
+    odometry: np.ndarray
+    scans: Scan
+    guessed: np.ndarray
+    after_pause: np.ndarray
+    new_drive: np.ndarray
 
 
 def keyframe_chunks(
-    config: Config,
-    submap: Submap | None,
-    odometry: np.ndarray,
-    scans: Scan,
-    guessed: np.ndarray,
+    config: Config, submap: Submap | None, drive: Drive
 ) -> Generator[KeyframeChunk]:
     """Match the scans of a log, and extract features and arcs of its keyframes, chunk by chunk.
 
-    Keyframes are chosen by `config.keyframe_distance`; the last scan of the log is one, too. Close
-    the iterator to stop the worker thread.
+    Keyframes are chosen by `config.keyframe_distance`; the first and the last scan of each piece
+    are some, too. Close the iterator to stop the worker thread.
 
     Args:
         config: Of front end, scan matching and keyframes.
-        submap: Of the scan matcher; None where scans are not matched: all are keyframes.
-        odometry: (T, 3) [m, m, rad] increments, NumPy.
-        scans: [T], NumPy.
-        guessed: (T,) bool, which increments are guesses of the reader.
+        submap: Of the scan matcher, empty; None where scans are not matched: all are keyframes.
+        drive: The log.
     """
-    first, num_matched, before, waiting = 0, 0, None, None
-    for after, odometry_of_some, matches in _match_ahead(config, submap, odometry, scans, guessed):
-        matched = MatchedScans(np.ones(len(odometry_of_some), bool), odometry_of_some, matches)
-        if matches is not None:
+    piece, first, before, after, waiting = 0, 0, None, submap, None
+
+    def complete(count: int) -> Iterator[KeyframeChunk]:
+        """The first `count` keyframes that wait, in chunks."""
+        nonlocal first, waiting
+        assert waiting is not None
+        ends, start = np.flatnonzero(waiting.is_keyframe) + 1, 0
+        for k in range(0, count, chunks.CHUNK):
+            end = int(ends[k : min(k + chunks.CHUNK, count)][-1])
+            some = _part(waiting, start, end)
+            yield _extract(config, after, first + start, some, drive.scans, piece)
+            start = end
+        first, waiting = first + start, _part(waiting, start, None)
+
+    def rest() -> Iterator[KeyframeChunk]:
+        """All that wait; the last one is a keyframe."""
+        if waiting is not None and len(waiting.is_keyframe):
+            waiting.is_keyframe[-1] = True
+            yield from complete(int(np.count_nonzero(waiting.is_keyframe)))
+
+    for part in _match_ahead(config, submap, drive):
+        if part.starts_piece:
+            yield from rest()
+            piece, before = piece + 1, None
+        after = part.submap
+        matched = MatchedScans(np.ones(len(part.odometry), bool), part.odometry, part.matches)
+        if part.matches is not None:
             is_keyframe, before = keyframes.choose_keyframes(
                 config.keyframe_distance, matched.increments, before
             )
             matched = matched._replace(is_keyframe=is_keyframe)
-        num_matched += len(odometry_of_some)
-        at_end = num_matched == len(odometry)
-        matched.is_keyframe[-1] |= at_end
         waiting = matched if waiting is None else concatenate([waiting, matched])
-        ends = np.flatnonzero(waiting.is_keyframe) + 1
-        complete = len(ends) if at_end else len(ends) // chunks.CHUNK * chunks.CHUNK
-        start = 0
-        for k in range(0, complete, chunks.CHUNK):
-            end = int(ends[k : k + chunks.CHUNK][-1])
-            yield _extract(config, after, first + start, _part(waiting, start, end), scans)
-            start = end
-        first, waiting = first + start, _part(waiting, start, None)
+        num_waiting = int(np.count_nonzero(waiting.is_keyframe))
+        yield from complete(num_waiting // chunks.CHUNK * chunks.CHUNK)
+    yield from rest()
 
 
 def _part(matched: MatchedScans, start: int, end: int | None) -> MatchedScans:
@@ -117,7 +149,12 @@ def concatenate(parts: list[Any]) -> Any:
 
 
 def _extract(
-    config: Config, submap: Submap | None, first: int, matched: MatchedScans, scans: Scan
+    config: Config,
+    submap: Submap | None,
+    first: int,
+    matched: MatchedScans,
+    scans: Scan,
+    piece: int,
 ) -> KeyframeChunk:
     """Start the front end on the keyframes of scans that begin at number `first` of the log."""
     own = matched.is_keyframe
@@ -128,37 +165,65 @@ def _extract(
         matches = keyframes.compose_matches(matched.matches, own)
     some = jax.tree.map(lambda x: x[numbers], scans)
     chunk = chunks.extract_matched(config, submap, odometry, some, matches)
-    return KeyframeChunk(chunk, numbers, odometry, matched)
+    return KeyframeChunk(chunk, numbers, odometry, matched, piece)
 
 
-def _match_ahead(
-    config: Config,
-    submap: Submap | None,
-    odometry: np.ndarray,
-    scans: Scan,
-    guessed: np.ndarray,
-) -> Iterator[tuple[Submap | None, np.ndarray, ScanMatch | None]]:
-    """For each chunk of scans the submap after it, its odometry (N, 3) and its matches [N]."""
-    starts = range(0, len(odometry), chunks.CHUNK)
+class _MatchedPart(NamedTuple):
+    """Successive scans that are matched: the submap after them; whether they follow a break."""
+
+    submap: Submap | None
+    odometry: np.ndarray
+    matches: ScanMatch | None
+    starts_piece: bool = False
+
+
+def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterator[_MatchedPart]:
+    """The scans of a drive, matched in chunks; those after a break begin with the empty submap."""
+    starts = range(0, len(drive.odometry), chunks.CHUNK)
     if submap is None:
         for start in starts:
-            yield None, odometry[start : start + chunks.CHUNK], None
+            yield _MatchedPart(None, drive.odometry[start : start + chunks.CHUNK], None)
         return
 
-    latest = submap
+    latest, is_start = submap, drive.new_drive.copy()
+    is_start[0] = False
+    num_returns = np.asarray(drive.scans.hit).sum(axis=1)
 
-    def match(start: int) -> tuple[Submap, np.ndarray, ScanMatch]:
+    def match(start: int) -> list[_MatchedPart]:
         nonlocal latest
-        increments, some = chunks.chunk_at(start, odometry, scans)
-        some_guessed = guessed[start : start + chunks.CHUNK]
-        latest, matches = chunks.match_chunk(config, latest, increments, some, some_guessed)
-        return latest, increments, matches
+        found: list[_MatchedPart] = []
+        stop = min(start + chunks.CHUNK, len(drive.odometry))
+        while start < stop:
+            new = np.flatnonzero(is_start[start + 1 : stop])
+            some = slice(start, start + 1 + int(new[0]) if new.size else stop)
+            increments, guessed = drive.odometry[some].copy(), drive.guessed[some].copy()
+            if is_start[start]:
+                latest, increments[0], guessed[0] = submap, 0.0, False
+            scans = jax.tree.map(lambda x, some=some: x[some], drive.scans)
+            after, matches = chunks.match_chunk(config, latest, increments, scans, guessed)
+            may_break = ~is_start[some]
+            may_break[0] &= start > 0
+            broken = breaks.first_break(
+                matches,
+                np.where(may_break, num_returns[some], 0),
+                drive.after_pause[some],
+                use_odometry=config.scan_matching.use_odometry,
+            )
+            count = len(increments)
+            if broken is not None:
+                is_start[start + broken], count = True, broken
+            if count:
+                matches = jax.tree.map(lambda x, count=count: x[:count], matches)
+                latest = after
+                found.append(_MatchedPart(after, increments[:count], matches, is_start[start]))
+            start += count
+        return found
 
     worker = ThreadPoolExecutor(1)
     try:
         run = chunks.with_settings(match)
         pending = deque(worker.submit(run, start) for start in starts)
         while pending:
-            yield pending.popleft().result()
+            yield from pending.popleft().result()
     finally:
         worker.shutdown(cancel_futures=True)

@@ -53,5 +53,6 @@ def test_all_goes_to_run_slam(log, source, monkeypatch):
     (config, params, increments, scans), options = log_input.run(found, smooth=False)
     assert config is found.config and increments is found.increments and scans is found.scans
     assert options.pop("odometry_guessed") is found.guessed is log.odometry_guessed
+    assert options.pop("after_pause") is found.after_pause and not found.after_pause.any()
     assert options == {"match_scans": source == "scan", "smooth": False, "callback": None}
     assert (params.scan_match_std_scale is None) == (source == "wheels")

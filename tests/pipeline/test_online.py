@@ -23,7 +23,7 @@ from jaxslam.matching import loop_closure, scan_matching
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.matching.registration import LoopClosureSpec
-from jaxslam.pipeline import chunks, offline, online
+from jaxslam.pipeline import chunks, offline, online, smoothing_stage
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import ray_casting, worlds
 from jaxslam.simulation.worlds import World
@@ -139,7 +139,7 @@ def test_chunks_give_the_result_of_one_filter_with_full_capacity(drive, results,
 
 def test_a_smoothed_drive_is_that_of_the_smoother(drive, results, monkeypatch):
     monkeypatch.setattr(chunks, "SLOT_BLOCK", CONFIG.filter.max_landmarks)
-    monkeypatch.setattr(offline, "PADDING_MULTIPLE", 8)
+    monkeypatch.setattr(smoothing_stage, "PADDING_MULTIPLE", 8)
     plain = results[False][0]
     found = online_slam(drive, match_scans=False, smooth=True)
     assert_close(found.info, plain.info)
@@ -170,9 +170,9 @@ def test_a_smoothed_drive_is_that_of_the_smoother(drive, results, monkeypatch):
 
 @pytest.mark.parametrize("rounds", [1, 2])
 def test_loop_closures_are_searched_and_smoothed_with(drive, monkeypatch, rounds):
-    monkeypatch.setattr(offline, "PADDING_MULTIPLE", 8)
+    monkeypatch.setattr(smoothing_stage, "PADDING_MULTIPLE", 8)
     if rounds == 2:
-        monkeypatch.setattr(offline, "CLOSURE_CONVERGED", 0.0)  # as if it had moved far
+        monkeypatch.setattr(smoothing_stage, "CLOSURE_CONVERGED", 0.0)  # as if it had moved far
     plain = online_slam(drive, smooth=True)
     assert [len(x) for x in plain.loop_closures] == [0] * 4  # it is too short to have any
     apart = relative(plain.poses[1], plain.poses[9])
@@ -186,7 +186,7 @@ def test_loop_closures_are_searched_and_smoothed_with(drive, monkeypatch, rounds
     monkeypatch.setattr(loop_closure, "find_loop_closures", find)
     found = online_slam(drive, smooth=True)
     np.testing.assert_allclose(relative(found.poses[1], found.poses[9]), apart + 0.01, atol=1e-4)
-    assert found.loop_closures is closure and len(calls) == rounds <= offline.MAX_CLOSURE_ROUNDS
+    assert found.loop_closures is closure and len(calls) == rounds <= smoothing_stage.MAX_CLOSURE_ROUNDS
     for poses, args in zip((plain.poses, found.poses), calls, strict=False):
         np.testing.assert_allclose(args[3], poses, atol=1e-3)
         assert args[:3] == (CONFIG.loop_closure, CONFIG.scan_matching, LIDAR)
@@ -272,7 +272,7 @@ def test_scans_between_keyframes_have_poses_by_their_own_motion(drive, with_keyf
 
 def test_a_smoothed_drive_on_keyframes_is_as_good_as_on_every_scan(drive, monkeypatch):
     """One scan of this drive is matched 0.14 m off; keyframes are not drawn after it."""
-    monkeypatch.setattr(offline, "PADDING_MULTIPLE", 8)
+    monkeypatch.setattr(smoothing_stage, "PADDING_MULTIPLE", 8)
     turn = np.linspace(0.0, 2.0, T)
     true = np.stack([np.cos(turn), np.sin(turn), turn + np.pi / 2], axis=1)
     errors = []
@@ -340,7 +340,7 @@ def test_a_log_of_another_length_needs_no_other_program(drive, results, caplog):
 
 
 def test_another_loop_closure_compiles_no_other_stage(drive, caplog, monkeypatch):
-    monkeypatch.setattr(offline, "PADDING_MULTIPLE", 8)
+    monkeypatch.setattr(smoothing_stage, "PADDING_MULTIPLE", 8)
 
     def run(spec):
         config = CONFIG._replace(loop_closure=spec)

@@ -76,8 +76,12 @@ class Agreement(NamedTuple):
         enough = whole >= 0.2 * 2 * self.state.shape[2]
         return np.where(enough, part / np.maximum(whole, 1), np.nan)
 
+    def of_pairs(self, kept: np.ndarray) -> Self:
+        """The comparison of the pairs (P,) that are True; of the others nothing is in view."""
+        return self.only(kept[:, None], kept[:, None])
+
     def only(self, first: np.ndarray, second: np.ndarray) -> Self:
-        """The comparison of ends (P, Q) of the first and of the second scans that are True."""
+        """The comparison of ends (P, Q or 1) of the first and of the second scans that are True."""
         kept = np.stack([first, second], axis=1)
         return self._replace(
             state=np.where(kept, self.state, OUT_OF_VIEW),

@@ -1,0 +1,115 @@
+"""Pieces of a broken drive: each is mapped alone, and joined to others where places are found.
+
+    piece 0  o--o--o--o--o--o--o     break     piece 1  o--o--o--o
+                   |__________________________________________|    the same place
+
+Pieces that are joined, by whatever other pieces, are a group: they have one frame, and become one
+map. Pieces that no place joins to the rest become maps of their own.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.se2_np import compose, relative
+from jaxslam.matching.joining import Join, find_join
+from jaxslam.matching.map_places import JoinSpec, ScanMap
+from jaxslam.pipeline import stages
+from jaxslam.pipeline.stages import KeyframeChunk
+
+JOIN_STD = (0.2, 0.2, 0.02)
+"""[m], [m], [rad] std of the motion from piece to piece, as the places found have it."""
+
+
+class Group(NamedTuple):
+    """Pieces with one frame, that of the first of them.
+
+    Attributes:
+        frames: (3,) [m, m, rad] frame of each piece by its number, in the order of time.
+        joins: What joined them, one fewer than pieces.
+    """
+
+    frames: dict[int, np.ndarray]
+    joins: tuple[Join, ...] = ()
+
+    @property
+    def pieces(self) -> tuple[int, ...]:
+        """Numbers of the pieces, in the order of time."""
+        return tuple(self.frames)
+
+
+def group_pieces(spec: JoinSpec, maps: Sequence[ScanMap]) -> list[Group]:
+    """Groups of pieces that can be joined, the largest first.
+
+    The pieces are compared with the groups so far, the largest ones first, until nothing joins any
+    more.
+
+    Args:
+        spec: Options.
+        maps: Of the pieces.
+    """
+    groups = [Group({k: np.zeros(3)}) for k in range(len(maps))]
+    tried: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
+    while True:
+        groups.sort(key=lambda group: -_size(maps, group))
+        pairs = [
+            (one, other)
+            for k, one in enumerate(groups)
+            for other in groups[k + 1 :]
+            if (one.pieces, other.pieces) not in tried
+        ]
+        for one, other in pairs:
+            tried.add((one.pieces, other.pieces))
+            join = find_join(spec, group_map(maps, one), group_map(maps, other))
+            if join.accepted:
+                groups = [g for g in groups if g is not one and g is not other]
+                groups.append(_merged(one, other, join))
+                break
+        else:
+            return groups
+
+
+def group_map(maps: Sequence[ScanMap], group: Group) -> ScanMap:
+    """All keyframes of a group, in its frame."""
+    poses = [compose(frame, maps[k].poses) for k, frame in group.frames.items()]
+    scans = stages.concatenate([maps[k].scans for k in group.pieces])
+    return ScanMap(maps[0].lidar, np.concatenate(poses), scans)
+
+
+def _size(maps: Sequence[ScanMap], group: Group) -> int:
+    """Number of keyframes of a group."""
+    return sum(len(maps[k].poses) for k in group.pieces)
+
+
+def _merged(one: Group, other: Group, join: Join) -> Group:
+    """Both groups as one, in the frame of the piece that is first in time."""
+    frames = one.frames | {k: compose(join.transform, x) for k, x in other.frames.items()}
+    origin = frames[min(frames)]
+    frames = {k: relative(origin, frames[k]) for k in sorted(frames)}
+    return Group(frames, (*one.joins, *other.joins, join))
+
+
+def after_gap(chunk: KeyframeChunk, increment: np.ndarray) -> KeyframeChunk:
+    """The first chunk of a piece, its first step the motion from the last keyframe before it.
+
+    Args:
+        chunk: The chunk.
+        increment: (3,) [m, m, rad] as the join has it.
+    """
+    measurements = chunk.chunk.measurements
+    match = measurements.scan_match
+    assert match is not None and match.expected is not None and match.expected_variance is not None
+
+    def put(held: Any, value: Any) -> Any:
+        return held.at[0].set(jnp.asarray(value, held.dtype))
+
+    match = match._replace(
+        information=put(match.information, np.zeros((3, 3))),
+        increment=put(match.increment, increment),
+        expected=put(match.expected, increment),
+        expected_variance=put(match.expected_variance, np.square(JOIN_STD)),
+    )
+    measurements = measurements._replace(scan_match=match)
+    return chunk._replace(chunk=chunk.chunk._replace(measurements=measurements))

@@ -32,6 +32,12 @@ OptionalFrame = Annotated[str | None, tyro.conf.arg(metavar="FRAME", help_behavi
 Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 """Option that names several files, or none."""
 
+FileOfEach = Annotated[
+    tyro.conf.UseAppendAction[tuple[Path, ...]],
+    tyro.conf.arg(metavar="FILE", help_behavior_hint=""),
+]
+"""Option that names a file for each log, given once for each, or none."""
+
 OutFolder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 """Option that names the folder of the results."""
 

@@ -14,7 +14,7 @@ from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, tum
+from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map
 from jaxslam.io.geojson import Arc, Node
 from jaxslam.io.output import write_json
 from jaxslam.mapping import pose_graph
@@ -31,16 +31,9 @@ KINDS = ("node", "corner", "wall")
 MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
 
 
-def write_results(
-    out_dir: Path,
-    numbers: Metrics,
-    times: np.ndarray,
-    poses: np.ndarray,
-    topological_map: TopologicalMap,
-) -> None:
-    """Write metrics.json, trajectory.tum and map.geojson to the folder `out_dir`."""
+def write_results(out_dir: Path, numbers: Metrics, topological_map: TopologicalMap) -> None:
+    """Write metrics.json and map.geojson to the folder `out_dir`."""
     write_json(out_dir / "metrics.json", numbers)
-    tum.write(out_dir / "trajectory.tum", times, poses)
     write_map(out_dir / "map.geojson", topological_map)
 
 
@@ -164,7 +157,7 @@ def draw(
     maps.draw_wrong_parts(axis, poses, wrong)
     maps.draw_arcs(axis, result.topological_map)
     maps.draw_landmarks(axis, result.belief, confirm_count=config.filter.confirm_count)
-    maps.draw_start_and_end(axis, poses)
+    maps.draw_start_and_end(axis, poses[np.isfinite(poses).all(axis=1)])
     canvas.legend(figure)
     figure.savefig(out_dir / "path.png")
 

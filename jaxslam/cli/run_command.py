@@ -1,7 +1,8 @@
 """The command `jaxslam run LOG`."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -9,6 +10,7 @@ from tqdm import tqdm
 
 from jaxslam.cli import report, run_results, summaries
 from jaxslam.cli.options import (
+    FileOfEach,
     OptionalCount,
     OptionalFile,
     OptionalTopic,
@@ -22,14 +24,17 @@ from jaxslam.cli.options import (
     require_odometry,
     stopwatch,
 )
-from jaxslam.cli.run_results import RunContext
+from jaxslam.cli.run_results import RecordedDrive, RunContext, without_errors
 from jaxslam.core.caches import enable_caches
+from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation import log_errors
+from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import relations as relations_file
 from jaxslam.io import tum
+from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder
 from jaxslam.pipeline import log_input
 from jaxslam.pipeline.log_input import LogInput, OdometrySource
@@ -41,9 +46,9 @@ INCONSISTENT = 3  # exit code of `--strict`
 
 
 def run(
-    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")],
-    reference: OptionalFile = None,
-    relations: OptionalFile = None,
+    log: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="LOG ...")],
+    reference: FileOfEach = (),
+    relations: FileOfEach = (),
     odometry: OdometrySource = "scan",
     smooth: bool = True,
     noise: OptionalFile = None,
@@ -72,9 +77,13 @@ def run(
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is
-            the log that the extra [data] installs.
-        reference: Reference trajectory to evaluate with: a TUM file with the log's clock.
-        relations: Verified relative poses to evaluate with, with the log's clock.
+            the log that the extra [data] installs. Several logs, of one robot or of several with
+            the same scanner, become one map where places of one are found in the others; each has
+            its own trajectory.1.tum, trajectory.2.tum and so on.
+        reference: Reference trajectory to evaluate with: a TUM file with the log's clock. Once for
+            each log.
+        relations: Verified relative poses to evaluate with, with the log's clock. Once for each
+            log.
         odometry: Scan matching fused with wheel odometry (scan), scan matching alone, for logs
             without odometry (scans-only), or wheel odometry alone (wheels).
         smooth: Batch-smooth the trajectory and landmarks, with loop closures; --no-smooth writes
@@ -92,50 +101,53 @@ def run(
         strict: Exit with code 3 if the map contradicts itself; all results are still written.
         out: Folder for the results.
     """
-    laser_log = scanner.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
-    require_beams(log, laser_log)
-    if odometry == "wheels":
-        require_odometry(log, laser_log)
-    known, reference_notes = None, []
-    if reference is not None:
-        known, more = tum.read_reference(reference)
-        reference_notes = [f"{reference}: {note}" for note in more]
-    verified = None if relations is None else relations_file.read(relations)
+    logs = [_read(path, scanner, odometry, scan_topic, odometry_topic) for path in log]
+    if not logs:
+        raise InputError("is missing", field="LOG", advice="name one log, or several")
+    references, reference_notes = _references(log, reference)
+    verified = _of_each("--relations", log, relations)
     match_scans = odometry != "wheels"
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
+    inputs, drives = [], []
+    for path, laser_log, known, file in zip(log, logs, references, verified, strict=True):
+        with name_errors(str(path)):
+            inputs.append(log_input.from_laser_log(laser_log, odometry))
+        checked = None if file is None else relations_file.read(file)
+        odom_poses = inputs[-1].odom_poses
+        dead_reckoning: Metrics = {}
+        with name_errors(str(path if known is None else known.path)):
+            if known is not None:
+                dead_reckoning |= log_errors.errors_against(
+                    laser_log, odom_poses, known.trajectory, None
+                )
+        with name_errors(str(file)):
+            dead_reckoning |= log_errors.errors_against(laser_log, odom_poses, None, checked)
+        trajectory = None if known is None else known.trajectory
+        drives.append(RecordedDrive(path, laser_log, trajectory, checked, dead_reckoning))
+    title = " ".join(map(str, log))
+    with name_errors(title):
+        given = log_input.combine(inputs)
+    config, scans = given.config, given.scans
     if scan is not None:
-        check_range("--scan", scan, 0, len(laser_log.times) - 1)
-    with name_errors(str(log)):
-        given = log_input.from_laser_log(laser_log, odometry)
-    config, odom_poses, scans = given.config, given.odom_poses, given.scans
-    with name_errors(str(reference)):
-        dead_reckoning = log_errors.errors_against(laser_log, odom_poses, known, None)
-    with name_errors(str(relations)):
-        dead_reckoning |= log_errors.errors_against(laser_log, odom_poses, None, verified)
+        check_range("--scan", scan, 0, len(given.increments) - 1)
     with folder(out) as out_dir:
         enable_caches()
-        size = f"{len(odom_poses)} scans of {config.frontend.lidar.num_beams} beams"
-        print(f"{log}: {size}{laser_log.source}", flush=True)
+        for drive in drives:
+            size = f"{len(drive.log.times)} scans of {config.frontend.lidar.num_beams} beams"
+            print(f"{drive.path}: {size}{drive.log.source}", flush=True)
         with stopwatch() as seconds:
             viewer = None
             if rerun is not None:
                 file = out_dir / "run.rrd" if rerun == "file" else None
-                viewer = RerunView(config, laser_log.times, scans, file)
+                times = np.concatenate([drive.log.times for drive in drives])
+                viewer = RerunView(config, times, scans, file)
             result = _run_slam(given, params, smooth=smooth, viewer=viewer)
         context = RunContext(
-            laser_log,
-            given,
-            params,
-            known,
-            verified,
-            dead_reckoning,
-            smooth=smooth,
-            of_base=pose_frame == "base",
-            gif=gif,
+            tuple(drives), given, params, smooth=smooth, of_base=pose_frame == "base", gif=gif
         )
         folders = [f"part_{k + 2}" for k in range(len(result.other_parts))]
         extra: Metrics = {
-            "skipped_lines": laser_log.num_skipped,
+            "skipped_lines": sum(drive.log.num_skipped for drive in drives),
             "mended": [*given.notes, *reference_notes, *result.notes],
             "odometry": given.odometry_source,
             "seconds": seconds,
@@ -146,13 +158,61 @@ def run(
         for name, part in zip(folders, result.other_parts, strict=True):
             (out_dir / name).mkdir()
             about: Metrics = {"mended": list(part.notes), "odometry": given.odometry_source}
-            alone = context._replace(reference=None, relations=None, dead_reckoning={})
+            alone = context._replace(drives=tuple(without_errors(drive) for drive in drives))
             num_warnings += run_results.write(alone, part, out_dir / name, about)[1]
         if scan is not None:
             report.draw_scan(out_dir / "scan.png", config, scans, scan)
     size = f"{numbers['scans']} scans, {numbers['keyframes']} keyframes"
-    summaries.print_summary(numbers, f"{size} of {log}", out)
+    summaries.print_summary(numbers, f"{size} of {title}", out)
     return INCONSISTENT if strict and num_warnings else 0
+
+
+class _Reference(NamedTuple):
+    """A reference trajectory, and its file."""
+
+    path: Path
+    trajectory: Trajectory
+
+
+def _read(
+    path: Path,
+    scanner: ScannerOptions,
+    odometry: OdometrySource,
+    scan_topic: str | None,
+    odometry_topic: str | None,
+) -> LaserLog:
+    """A log that can be mapped."""
+    log = scanner.read_log(path, scan_topic=scan_topic, odometry_topic=odometry_topic)
+    require_beams(path, log)
+    if odometry == "wheels":
+        require_odometry(path, log)
+    return log
+
+
+def _of_each(option: str, logs: Sequence[Path], files: Sequence[Path]) -> Sequence[Path | None]:
+    """The file of each log; None where none is given for any."""
+    if files and len(files) != len(logs):
+        advice = "give the option once for each log, in their order"
+        raise InputError(
+            f"is given {len(files)} times for {len(logs)} logs", field=option, advice=advice
+        )
+    return files or [None] * len(logs)
+
+
+def _references(
+    logs: Sequence[Path], files: Sequence[Path]
+) -> tuple[list[_Reference | None], list[str]]:
+    """Reference trajectory of each log, and notes on them."""
+    references: list[_Reference | None] = []
+    notes: list[str] = []
+    for path in _of_each("--reference", logs, files):
+        if path is None:
+            references.append(None)
+            continue
+        trajectory, more = tum.read_reference(path)
+        references.append(_Reference(path, trajectory))
+        notes += [f"{path}: {note}" for note in more]
+    return references, notes
 
 
 def _run_slam(

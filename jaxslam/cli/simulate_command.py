@@ -98,7 +98,8 @@ def simulate(
             key, config, params, robot, walls, path, trial=0, num_scans=num_scans
         )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
-        report.write_results(out_dir, numbers, stamps, result.poses, result.topological_map)
+        report.write_results(out_dir, numbers, result.topological_map)
+        tum.write(out_dir / "trajectory.tum", stamps, result.poses)
         tum.write(out_dir / "truth.tum", stamps, truth)
         trajectories = {"odometry": np.asarray(results.dead_reckoning[0]), "truth": truth}
         error = log_errors.pose_errors(result.poses, truth)

@@ -33,6 +33,9 @@ def print_summary(numbers: Metrics, title: str, out: Path) -> None:
     if odometry:
         print(f"{'':36}{'SLAM':>10}{'odometry':>10}{'ratio':>8}")
     _print_errors(numbers | numbers.get("relations", {}), odometry | odometry.get("relations", {}))
+    for drive in numbers.get("drives", ()):
+        print(f"  {drive['log']}: {drive['scans']} scans, {drive['path_length_m']:.0f} m")
+        _print_errors(drive | drive.get("relations", {}), {})
     if "diverged" in numbers:
         print(f"  {'diverged trials':34}{numbers['diverged']:10d}{odometry['diverged']:10d}")
     if numbers.get("nees") is not None:

@@ -1,9 +1,9 @@
 """Where a drive is broken: from one scan to the next the robot was moved, and none knows how far.
 
-A robot that was carried, or whose log lacks scans, is found out by its first scan after it. After a pause of
-the scanner, the scan contradicts the wheels, or explains little. Without a pause, hardly any of
-it is explained, though a wide window was searched. What comes after a break is a piece of its own,
-with a trajectory and walls in its own frame; `pieces` joins them.
+A robot that was carried, or whose log lacks scans, is found out by its first scan after that.
+After a pause of the scanner, this contradicts the wheels, or explains little. Without a pause,
+hardly any of it is explained, though a wide window was searched. What comes after a break is a
+piece of its own, with a trajectory and walls in its own frame; `pieces` joins them.
 """
 
 import numpy as np

@@ -1,8 +1,9 @@
 """From a recorded log to the arguments of `run_slam`, with the presets of `jaxslam run`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -32,6 +33,7 @@ class LogInput(NamedTuple):
         increments: (T, 3) [m, m, rad] odometry increments, zero at the first scan.
         guessed: (T,) bool, which of them are guesses of the reader; None for none.
         after_pause: (T,) bool, before which scans the robot may have been moved unseen.
+        new_drive: (T,) bool, which scans begin another log than the one before.
         scans: [T].
         notes: What was wrong with the log, or had to be assumed.
     """
@@ -42,6 +44,7 @@ class LogInput(NamedTuple):
     increments: np.ndarray
     guessed: np.ndarray | None
     after_pause: np.ndarray
+    new_drive: np.ndarray
     scans: Scan
     notes: tuple[str, ...]
 
@@ -75,8 +78,65 @@ def from_laser_log(laser_log: LaserLog, source: OdometrySource = "scan") -> LogI
     scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
     arguments.as_scans(config.frontend.lidar, laser_log.ranges, len(odometry))
     guessed = laser_log.odometry_guessed
-    after_pause = breaks.pauses(laser_log.times)
-    return LogInput(config, source, odom_poses, odometry, guessed, after_pause, scans, notes)
+    return LogInput(
+        config=config,
+        odometry_source=source,
+        odom_poses=odom_poses,
+        increments=odometry,
+        guessed=guessed,
+        after_pause=breaks.pauses(laser_log.times),
+        new_drive=np.zeros(len(odometry), bool),
+        scans=scans,
+        notes=notes,
+    )
+
+
+def combine(logs: Sequence[LogInput]) -> LogInput:
+    """Several drives as one input, each at an unknown place to the others.
+
+    Args:
+        logs: One or more, of the same scanner and the same source of odometry.
+
+    Raises:
+        ValueError: There is none; a scanner or source differs from that of the first, or the wheels
+            alone are used: drives are joined by their scans.
+    """
+    if not logs:
+        raise ValueError("logs is empty: one log at least is expected")
+    first = logs[0]
+    if len(logs) == 1:
+        return first
+    for number, log in enumerate(logs[1:], 2):
+        own, other = (x.config.frontend.lidar for x in (log, first))
+        for field in own._fields:
+            if getattr(own, field) != getattr(other, field):
+                raise ValueError(
+                    f"log {number} has a scanner with {field} {getattr(own, field):g}, log 1 one "
+                    f"with {getattr(other, field):g}; drives are joined by scans of one scanner"
+                )
+        if log.odometry_source != first.odometry_source:
+            raise ValueError(
+                f"log {number} uses odometry {log.odometry_source!r}, log 1 "
+                f"{first.odometry_source!r}; take scans-only for all"
+            )
+    if first.odometry_source == "wheels":
+        raise ValueError("drives are joined by their scans: take another odometry than wheels")
+    lengths = [len(log.increments) for log in logs]
+    guessed = [
+        np.zeros(n, bool) if log.guessed is None else log.guessed
+        for log, n in zip(logs, lengths, strict=True)
+    ]
+    new_drive = np.zeros(sum(lengths), bool)
+    new_drive[np.cumsum(lengths)[:-1]] = True
+    return first._replace(
+        odom_poses=np.concatenate([log.odom_poses for log in logs]),
+        increments=np.concatenate([log.increments for log in logs]),
+        guessed=np.concatenate(guessed),
+        after_pause=np.concatenate([log.after_pause for log in logs]),
+        new_drive=new_drive,
+        scans=jax.tree.map(lambda *x: np.concatenate(x), *[log.scans for log in logs]),
+        notes=tuple(f"log {k}: {note}" for k, log in enumerate(logs, 1) for note in log.notes),
+    )
 
 
 def run(
@@ -101,6 +161,7 @@ def run(
         log.scans,
         odometry_guessed=log.guessed,
         after_pause=log.after_pause,
+        new_drive=log.new_drive,
         match_scans=log.match_scans,
         smooth=smooth,
         callback=callback,

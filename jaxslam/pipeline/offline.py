@@ -162,8 +162,8 @@ def run_slam(
     for part in others:
         scans_of_part = np.flatnonzero(part.piece >= 0)
         notes += (
-            f"scans {scans_of_part[0]}-{scans_of_part[-1]} follow or precede a break of the drive, "
-            "and no place joins them to the rest: they are a map of their own",
+            f"scans {scans_of_part[0]}-{scans_of_part[-1]} share no place with the rest that was "
+            "found again: they are a map of their own",
         )
     return main._replace(notes=notes + main.notes, other_parts=tuple(others))
 
@@ -258,8 +258,8 @@ def _notes(group: Group, alone: Sequence[_Filtered]) -> tuple[str, ...]:
     ]
     places = min(join.num_places for join in group.joins)
     return (
-        f"the drive is broken: scans {' and '.join(spans)} were mapped on their own, and joined by "
-        f"{places} places that were found again",
+        f"scans {' and '.join(spans)} are different drives, or the drive is broken between them: "
+        f"mapped alone, and joined by {places} places that were found again",
     )
 
 

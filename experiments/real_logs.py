@@ -40,7 +40,7 @@ from jaxslam.frontend import lidar
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes, offline, smoothing_stage
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.offline import SlamResult
+from jaxslam.pipeline.results import SlamResult
 from jaxslam.tuning import fitting
 
 NAME = "real_logs"

@@ -19,8 +19,9 @@ from jaxslam.io.geojson import Arc, Node
 from jaxslam.io.output import write_json
 from jaxslam.mapping import pose_graph
 from jaxslam.mapping.occupancy import occupancy_map
+from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.offline import SlamResult
+from jaxslam.pipeline.results import SlamResult
 from jaxslam.pipeline.saving import to_saved_map
 from jaxslam.simulation.worlds import World
 from jaxslam.tuning.fitting import TuneResult
@@ -45,6 +46,7 @@ def write_maps(
     measurements: Measurement,
     times: np.ndarray,
     scans: Scan,
+    saved_map: SavedMap | None = None,
 ) -> None:
     """Write map.yaml, map.pgm, graph.g2o, map.npz and, if networkx is installed, map.graphml.
 
@@ -55,10 +57,12 @@ def write_maps(
         result: Result of SLAM.
         measurements: [K] inputs of the filter.
         times: (K,) [s] of the keyframes.
-        scans: [K] of the keyframes, which the occupancy grid is made of.
+        scans: [K] of the keyframes.
+        saved_map: The map that the run went on in, if any.
     """
     poses = result.poses[result.keyframes]
-    grid = occupancy_map(config.frontend.lidar, poses, scans, resolution=MAP_RESOLUTION)
+    kept = to_saved_map(config, params, result, times, scans, saved_map)
+    grid = occupancy_map(config.frontend.lidar, kept.poses, kept.scans, resolution=MAP_RESOLUTION)
     ros_map.write(out_dir / "map.yaml", grid)
     graph = pose_graph.build_pose_graph(
         config.filter,
@@ -70,8 +74,7 @@ def write_maps(
         result.loop_closures,
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
-    saved_map = to_saved_map(config, params, result, times, scans)
-    map_file.write(out_dir / map_file.NAME, saved_map)
+    map_file.write(out_dir / map_file.NAME, kept)
     if find_spec("networkx") is not None:
         graphml.write(out_dir / "map.graphml", result.topological_map)
 
@@ -121,6 +124,7 @@ def draw(
     *,
     world: World | None = None,
     scans: Scan | None = None,
+    saved_scans: Scan | None = None,
     wrong: Sequence[tuple[int, int]] = (),
 ) -> None:
     """Draw path.png and errors.png.
@@ -133,6 +137,7 @@ def draw(
         error: (K, 3) pose errors [m, m, rad] of the keyframes, if known.
         world: World whose walls are drawn.
         scans: Scans [K] of the keyframes, whose end points are drawn.
+        saved_scans: Scans [S] of the saved keyframes, likewise.
         wrong: First and last number of scans where the map contradicts itself.
     """
     # Imported here, because matplotlib is slow to import.
@@ -150,6 +155,10 @@ def draw(
     if scans is not None:
         points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
         maps.draw_hits(axis, poses[result.keyframes], np.asarray(points), np.asarray(scans.hit))
+    if saved_scans is not None and result.saved_poses is not None:
+        points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, saved_scans)
+        hit = np.asarray(saved_scans.hit)
+        maps.draw_hits(axis, result.saved_poses, np.asarray(points), hit)
     breaks = np.flatnonzero(np.diff(result.piece)) + 1  # across which no line is drawn
     estimate = np.insert(poses, breaks, np.nan, axis=0)
     for what, line in (lines | {"estimate": estimate}).items():

@@ -35,11 +35,13 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import relations as relations_file
 from jaxslam.io import tum
 from jaxslam.io.errors import InputError
+from jaxslam.io.map_file import load_map
 from jaxslam.io.output import folder
-from jaxslam.pipeline import log_input
+from jaxslam.mapping.saved_map import SavedMap
+from jaxslam.pipeline import log_input, sessions
 from jaxslam.pipeline.log_input import LogInput, OdometrySource
-from jaxslam.pipeline.offline import SlamResult
 from jaxslam.pipeline.online import ChunkResult, SlamState
+from jaxslam.pipeline.results import SlamResult
 from jaxslam.viz.rerun_view import RerunView
 
 INCONSISTENT = 3  # exit code of `--strict`
@@ -52,6 +54,9 @@ def run(
     odometry: OdometrySource = "scan",
     smooth: bool = True,
     noise: OptionalFile = None,
+    saved_map: Annotated[
+        Path | None, tyro.conf.arg(name="map", metavar="DIR", help_behavior_hint="")
+    ] = None,
     scan_topic: OptionalTopic = None,
     odometry_topic: OptionalTopic = None,
     scanner: Scanner = ScannerOptions(),  # noqa: B008
@@ -89,6 +94,8 @@ def run(
         smooth: Batch-smooth the trajectory and landmarks, with loop closures; --no-smooth writes
             the online estimates.
         noise: File of the noise parameters of the filter (Q and R); by default cautious ones.
+        saved_map: Output folder of an earlier run, of the same scanner, whose map is continued:
+            where its places are found again, landmarks keep their ids, and new ones are added.
         scan_topic: Topic of the laser scans in a bag; by default the one with most messages.
         odometry_topic: Topic of the odometry or of the transforms in a bag; by default the one
             with most messages.
@@ -107,6 +114,7 @@ def run(
     references, reference_notes = _references(log, reference)
     verified = _of_each("--relations", log, relations)
     match_scans = odometry != "wheels"
+    earlier = None if saved_map is None else load_map(saved_map)
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     inputs, drives = [], []
     for path, laser_log, known, file in zip(log, logs, references, verified, strict=True):
@@ -127,6 +135,11 @@ def run(
     title = " ".join(map(str, log))
     with name_errors(title):
         given = log_input.combine(inputs)
+    if earlier is not None:
+        with name_errors(f"--map {saved_map}"):
+            sessions.check_saved_map(earlier, given.config.frontend.lidar)
+            if not match_scans:
+                raise ValueError("a map is continued by scans: not with --odometry wheels")
     config, scans = given.config, given.scans
     if scan is not None:
         check_range("--scan", scan, 0, len(given.increments) - 1)
@@ -141,9 +154,15 @@ def run(
                 file = out_dir / "run.rrd" if rerun == "file" else None
                 times = np.concatenate([drive.log.times for drive in drives])
                 viewer = RerunView(config, times, scans, file)
-            result = _run_slam(given, params, smooth=smooth, viewer=viewer)
+            result = _run_slam(given, params, earlier, smooth=smooth, viewer=viewer)
         context = RunContext(
-            tuple(drives), given, params, smooth=smooth, of_base=pose_frame == "base", gif=gif
+            tuple(drives),
+            given,
+            params,
+            smooth=smooth,
+            of_base=pose_frame == "base",
+            gif=gif,
+            saved_map=earlier,
         )
         folders = [f"part_{k + 2}" for k in range(len(result.other_parts))]
         extra: Metrics = {
@@ -216,7 +235,12 @@ def _references(
 
 
 def _run_slam(
-    given: LogInput, params: NoiseParams, *, smooth: bool, viewer: RerunView | None
+    given: LogInput,
+    params: NoiseParams,
+    saved_map: SavedMap | None,
+    *,
+    smooth: bool,
+    viewer: RerunView | None,
 ) -> SlamResult:
     """Run SLAM on a log, with a progress bar."""
     num_scans = len(given.increments)
@@ -232,7 +256,9 @@ def _run_slam(
             if viewer is not None:
                 viewer.watch(state, chunk)
 
-        result = log_input.run(given, params, smooth=smooth, callback=show_progress)
+        result = log_input.run(
+            given, params, saved_map=saved_map, smooth=smooth, callback=show_progress
+        )
     if viewer is not None:
         viewer.end(result)
     return result

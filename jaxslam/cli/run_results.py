@@ -10,15 +10,16 @@ import numpy as np
 from jaxslam.cli import report
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.se2_np import compose, relative
+from jaxslam.core.se2_np import compose, relative, trajectories_as_one
 from jaxslam.evaluation import log_errors, map_consistency
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import tum
+from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.log_input import LogInput
-from jaxslam.pipeline.offline import SlamResult
+from jaxslam.pipeline.results import SlamResult
 
 ROUNDING = 1e-3  # [s] of written times
 
@@ -51,6 +52,7 @@ class RunContext(NamedTuple):
         smooth: Whether trajectories are smoothed.
         of_base: Whether trajectory.tum holds poses of the robot, not of the scanner.
         gif: Whether an animation is written.
+        saved_map: The map that the run goes on in, if any.
     """
 
     drives: tuple[RecordedDrive, ...]
@@ -59,6 +61,7 @@ class RunContext(NamedTuple):
     smooth: bool
     of_base: bool
     gif: bool
+    saved_map: SavedMap | None = None
 
 
 def without_errors(drive: RecordedDrive) -> RecordedDrive:
@@ -121,7 +124,8 @@ def write(
         path = here.result.poses if given.match_scans else here.odometry
         length = sum(log_errors.path_length(x) for x in np.split(path, _breaks(here.result)))
         path_length += length
-        about, error = _errors(context, drive, here, at_start=number == 0)
+        at_start = number == 0 and result.saved_poses is None
+        about, error = _errors(context, drive, here, at_start=at_start)
         if error is not None:
             errors[np.isin(result.keyframes, here.rows)] = error
         if several:
@@ -151,15 +155,19 @@ def write(
     )
     of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
     times = np.concatenate([drive.log.times for drive in context.drives])[result.keyframes]
-    report.write_maps(out_dir, config, context.params, result, measurements, times, of_keyframes)
+    saved = None if result.saved_poses is None else context.saved_map
+    report.write_maps(
+        out_dir, config, context.params, result, measurements, times, of_keyframes, saved
+    )
     bounds = [(warning.first_scan, warning.last_scan) for warning in consistency.warnings]
     report.draw(
         out_dir,
         config,
         result,
-        {what: _with_gaps(line) for what, line in lines.items() if line},
+        {what: trajectories_as_one(line) for what, line in lines.items() if line},
         errors if np.isfinite(errors).any() else None,
         scans=of_keyframes,
+        saved_scans=None if saved is None else saved.scans,
         wrong=bounds,
     )
     if context.gif:
@@ -257,10 +265,3 @@ def _known_times(log: LaserLog, result: SlamResult, relations: Relations) -> Rel
 def _breaks(result: SlamResult) -> np.ndarray:
     """Indices of the first scans of pieces, without that of the first one."""
     return np.flatnonzero(np.diff(result.piece)) + 1
-
-
-def _with_gaps(lines: list[np.ndarray]) -> np.ndarray:
-    """Trajectories (N, 3) as one, between which no line is drawn."""
-    gap = np.full((1, 3), np.nan)
-    parts = [x for line in lines for x in (gap, line)]
-    return np.concatenate(parts[1:])

@@ -3,6 +3,8 @@
 Frames and poses may lead with any axes here, and dtypes follow NumPy's rules: float64 for logs.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
@@ -71,3 +73,9 @@ def increments(poses: np.ndarray) -> np.ndarray:
 def motion_size(increments: np.ndarray) -> np.ndarray:
     """Sizes (...) [m] of increments (..., 3), of which a radian counts as half a metre."""
     return np.hypot(increments[..., 0], increments[..., 1]) + 0.5 * np.abs(increments[..., 2])
+
+
+def trajectories_as_one(trajectories: Sequence[np.ndarray]) -> np.ndarray:
+    """Trajectories (T, 3) one after the other, with a row of NaN between two of them."""
+    gap = np.full((1, 3), np.nan)
+    return np.concatenate([x for one in trajectories for x in (gap, one)][1:])

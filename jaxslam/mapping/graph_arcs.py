@@ -165,7 +165,7 @@ def driven_arcs(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> lis
     Args:
         xy: (N, 2) [m] positions of the nodes.
         clearance: (N,) [m] radii of their circles.
-        poses: (T, 3) [m, m, rad] trajectory, map frame.
+        poses: (T, 3) [m, m, rad] trajectory, map frame; across a row of NaN, no piece.
 
     Returns:
         The pieces in order, clearance NaN, each `DEFAULT_POINTS` points long.
@@ -173,6 +173,9 @@ def driven_arcs(xy: np.ndarray, clearance: np.ndarray, poses: np.ndarray) -> lis
     positions = np.asarray(poses, float)[:, :2]
     driven, last_node, left_at = [], -1, 0
     for step, position in enumerate(positions):
+        if not np.isfinite(position).all():
+            last_node = -1
+            continue
         node = node_at(position, xy, clearance)
         if node >= 0 and last_node >= 0 and (node != last_node or step > left_at + 1):
             line = np.concatenate([xy[[last_node]], positions[left_at : step + 1], xy[[node]]])

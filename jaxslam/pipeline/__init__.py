@@ -9,7 +9,6 @@ from jaxslam.pipeline.episodes import episode_from_laser_log as episode_from_las
 from jaxslam.pipeline.episodes import filter_episodes as filter_episodes
 from jaxslam.pipeline.episodes import landmark_log_config as landmark_log_config
 from jaxslam.pipeline.episodes import laser_log_config as laser_log_config
-from jaxslam.pipeline.offline import SlamResult as SlamResult
 from jaxslam.pipeline.offline import run_slam as run_slam
 from jaxslam.pipeline.online import ChunkResult as ChunkResult
 from jaxslam.pipeline.online import SlamState as SlamState
@@ -17,5 +16,6 @@ from jaxslam.pipeline.online import init as init
 from jaxslam.pipeline.online import match_log as match_log
 from jaxslam.pipeline.online import topological_map as topological_map
 from jaxslam.pipeline.online import update as update
+from jaxslam.pipeline.results import SlamResult as SlamResult
 from jaxslam.pipeline.saving import to_saved_map as to_saved_map
 from jaxslam.pipeline.stacking import stack_episodes as stack_episodes

@@ -12,11 +12,12 @@ from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import increments, relative
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
+from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline import arguments, breaks, offline
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.offline import SlamResult
 from jaxslam.pipeline.online import SlamState
+from jaxslam.pipeline.results import SlamResult
 
 OdometrySource = Literal["scan", "scans-only", "wheels"]
 """Scan matching fused with wheel odometry, scan matching alone, or wheel odometry alone."""
@@ -143,6 +144,7 @@ def run(
     log: LogInput,
     params: NoiseParams | None = None,
     *,
+    saved_map: SavedMap | None = None,
     smooth: bool = True,
     callback: Callable[[SlamState, ChunkResult], Any] | None = None,
 ) -> SlamResult:
@@ -151,6 +153,7 @@ def run(
     Args:
         log: The input.
         params: Q and R of the filter; by default those for recorded logs.
+        saved_map: As of `run_slam`.
         smooth: As of `run_slam`.
         callback: As of `run_slam`.
     """
@@ -162,6 +165,7 @@ def run(
         odometry_guessed=log.guessed,
         after_pause=log.after_pause,
         new_drive=log.new_drive,
+        saved_map=saved_map,
         match_scans=log.match_scans,
         smooth=smooth,
         callback=callback,

@@ -1,77 +1,36 @@
 """SLAM on a whole log: chunks of keyframes, then batch smoothing with loop closures."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxslam.core.features import Features
-from jaxslam.core.maps import TopologicalMap
-from jaxslam.core.measurement import Measurement, ScanMatch
+from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
-from jaxslam.core.se2_np import compose, relative
-from jaxslam.filtering.belief import Belief
+from jaxslam.core.se2_np import compose, relative, trajectories_as_one
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.filtering.slam_filter import StepInfo
-from jaxslam.mapping.arc_table import ArcTable
-from jaxslam.matching.loop_closure import LoopClosures
+from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.matching.map_places import ScanMap
-from jaxslam.pipeline import arguments, keyframes, odometry_notes, online, pieces, stages
+from jaxslam.pipeline import (
+    arguments,
+    keyframes,
+    odometry_notes,
+    online,
+    pieces,
+    sessions,
+    stages,
+)
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.online import SlamState
 from jaxslam.pipeline.pieces import Group
+from jaxslam.pipeline.results import SlamResult, piece_of, spread
 from jaxslam.pipeline.smoothing_stage import smooth_result
 from jaxslam.pipeline.stages import Drive, KeyframeChunk
 
 Callback = Callable[[SlamState, ChunkResult], Any]
-
-
-class SlamResult(NamedTuple):
-    """Result of SLAM on a log of T scans, K of which are keyframes.
-
-    Attributes:
-        poses: (T, 3) float64 [m, m, rad] estimated trajectory, map frame: filtered, or smoothed;
-            NaN for scans that are in none of its pieces.
-        online_poses: (T, 3) float64 [m, m, rad] estimates at the time: those of the filter, and
-            between keyframes the matched motion since.
-        keyframes: (K,) int numbers of the keyframes, which the filter was given; the first and the
-            last scan are among them. All scans where `config.keyframe_distance` is None.
-        belief: Of the filter after the last scan; if smoothed, with the smoothed last pose and
-            landmark positions, and still the covariance of the filter.
-        info: [K] diagnostics of the filter, with its estimates at the time.
-        features: [K] features.
-        topological_map: Topological map.
-        scan_matches: [K] increments by scan matching since the keyframe before, where scans were
-            matched.
-        loop_closures: Loop closures that the trajectory was smoothed with, where there were any;
-            they are between keyframes, by their index 0 .. K - 1.
-        odometry: (K, 3) [m, m, rad] increments since the keyframe before that the filter was given:
-            repaired, or zero where odometry is not used.
-        notes: What was wrong with the odometry, to be printed.
-        arcs: Arcs that the topological map is made of, as observed; to go on from.
-        piece: (T,) int piece of the drive that each scan is in, from 0; -1 for scans that are not
-            in this map.
-        other_parts: Maps of the pieces that nothing joins to this one, each in a frame of its own,
-            the largest first.
-    """
-
-    poses: np.ndarray
-    online_poses: np.ndarray
-    keyframes: np.ndarray
-    belief: Belief
-    info: StepInfo
-    features: Features
-    topological_map: TopologicalMap
-    scan_matches: ScanMatch | None = None
-    loop_closures: LoopClosures | None = None
-    odometry: np.ndarray | None = None
-    notes: tuple[str, ...] = ()
-    arcs: ArcTable | None = None
-    piece: np.ndarray = np.zeros(0, int)
-    other_parts: "tuple[SlamResult, ...]" = ()
 
 
 def run_slam(
@@ -84,6 +43,7 @@ def run_slam(
     odometry_guessed: Any = None,
     after_pause: Any = None,
     new_drive: Any = None,
+    saved_map: SavedMap | None = None,
     match_scans: bool = True,
     smooth: bool = True,
     callback: Callback | None = None,
@@ -119,6 +79,9 @@ def run_slam(
             `breaks.pauses` finds them by time; none by default. Only such as contradict the wheels,
             or fit the scans before badly, are breaks.
         new_drive: (T,) bool, which scans begin another drive, at an unknown place; none by default.
+        saved_map: A map to go on in, of the same scanner. Where places of it are found again, the
+            result is in its frame and goes on with its landmarks and their ids; where none are,
+            it is a map of its own, and a note says so. `start` is then not used.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
         callback: Called after each chunk of keyframes with the state and the result of the chunk;
@@ -140,8 +103,11 @@ def run_slam(
     guessed = arguments.as_flags("odometry_guessed", odometry_guessed, count)
     after_pause = arguments.as_flags("after_pause", after_pause, count)
     new_drive = arguments.as_flags("new_drive", new_drive, count)
-    if new_drive[1:].any() and not match_scans:
-        raise ValueError("new_drive: drives are joined by their scans; take match_scans=True")
+    if not match_scans and (new_drive[1:].any() or saved_map is not None):
+        name = "saved_map" if saved_map is not None else "new_drive"
+        raise ValueError(f"{name}: drives are joined by their scans; take match_scans=True")
+    if saved_map is not None:
+        sessions.check_saved_map(saved_map, config.frontend.lidar)
     if match_scans and config.scan_matching.use_odometry:
         unknown = after_pause | new_drive
         increments, is_share, notes = odometry_notes.share_out(increments, scans, unknown)
@@ -156,9 +122,14 @@ def run_slam(
     log = stages.keyframe_chunks(config, state.submap, drive)
     with closing(log):  # whatever happens, no scans are matched any more after it
         first, later = _first_piece(run, state, pose, log)
-    results = [_result(run, first)] if not later else _several_pieces(run, first, later)
-    results.sort(key=lambda result: -np.count_nonzero(result.piece >= 0))
+    if later or saved_map is not None:
+        results = _several_pieces(run, first, later, saved_map)
+    else:
+        results = [_result(run, first)]
+    results.sort(key=_importance)
     main, *others = results
+    if saved_map is not None and main.saved_poses is None:
+        notes += ("no place of the saved map was found again: this is a map of its own",)
     for part in others:
         scans_of_part = np.flatnonzero(part.piece >= 0)
         notes += (
@@ -166,6 +137,11 @@ def run_slam(
             "found again: they are a map of their own",
         )
     return main._replace(notes=notes + main.notes, other_parts=tuple(others))
+
+
+def _importance(result: SlamResult) -> tuple[bool, int]:
+    """Sorts results: what goes on in a saved map first, then those of most scans."""
+    return result.saved_poses is None, -int(np.count_nonzero(result.piece >= 0))
 
 
 class _Run(NamedTuple):
@@ -184,6 +160,7 @@ class _Filtered(NamedTuple):
 
     start: Any
     state: SlamState
+    saved: SavedMap | None = None
     chunks: tuple[KeyframeChunk, ...] = ()
     results: tuple[ChunkResult, ...] = ()
 
@@ -214,33 +191,36 @@ def _filter(run: _Run, filtered: _Filtered, chunks: Sequence[KeyframeChunk]) -> 
 
 
 def _several_pieces(
-    run: _Run, first: _Filtered, later: Sequence[KeyframeChunk]
+    run: _Run, first: _Filtered, later: Sequence[KeyframeChunk], saved: SavedMap | None
 ) -> list[SlamResult]:
-    """Results of the groups of pieces that can be joined."""
-    quiet = run._replace(callback=None)
-    alone = [first]
+    """Results of the groups of pieces, and perhaps of a saved map, that can be joined."""
+    quiet, alone = run._replace(callback=None), {0: first}
     for chunk in later:
-        if chunk.piece == len(alone):
+        if chunk.piece not in alone:
             start = arguments.as_start(None)
-            alone.append(_Filtered(start, online.init(run.config, start)))
+            alone[chunk.piece] = _Filtered(start, online.init(run.config, start))
         alone[chunk.piece] = _filter(quiet, alone[chunk.piece], [chunk])
-    found = [_result(run, piece) for piece in alone]
-    groups = pieces.group_pieces(run.config.joining, [_scan_map(run, one) for one in found])
+    found = {number: _result(run, piece) for number, piece in alone.items()}
+    maps = {number: _scan_map(run, one) for number, one in found.items()}
+    if saved is not None:
+        maps[pieces.SAVED] = sessions.scan_map(saved)
+        start = arguments.as_start(saved.poses[0])
+        alone[pieces.SAVED] = _Filtered(start, sessions.resume(run.config, saved), saved)
     results = []
-    for group in groups:
-        if len(group.pieces) == 1:
-            number = group.pieces[0]
+    for group in pieces.group_pieces(run.config.joining, maps):
+        number, *left = group.pieces
+        if left:
+            filtered = alone[number]
+            own = [compose(frame, maps[k].poses) for k, frame in group.frames.items()]
+            for before, after, number in zip(own, own[1:], left, strict=False):
+                chunks = alone[number].chunks
+                gap = relative(before[-1], after[0])
+                filtered = _filter(run, filtered, [pieces.after_gap(chunks[0], gap), *chunks[1:]])
+            results.append(_result(run, filtered, np.concatenate(own), _notes(group, alone)))
+        elif number != pieces.SAVED:
             if number > 0 and run.callback is not None:
                 run.callback(alone[number].state, alone[number].results[-1])
             results.append(found[number])
-            continue
-        filtered = alone[group.pieces[0]]
-        own = [compose(frame, _scan_map(run, found[k]).poses) for k, frame in group.frames.items()]
-        for before, after, number in zip(own, own[1:], group.pieces[1:], strict=False):
-            chunks = alone[number].chunks
-            gap = relative(before[-1], after[0])
-            filtered = _filter(run, filtered, [pieces.after_gap(chunks[0], gap), *chunks[1:]])
-        results.append(_result(run, filtered, np.concatenate(own), _notes(group, alone)))
     return results
 
 
@@ -250,16 +230,17 @@ def _scan_map(run: _Run, result: SlamResult) -> ScanMap:
     return ScanMap(run.config.frontend.lidar, result.poses[result.keyframes], scans)
 
 
-def _notes(group: Group, alone: Sequence[_Filtered]) -> tuple[str, ...]:
+def _notes(group: Group, alone: Mapping[int, _Filtered]) -> tuple[str, ...]:
     """A note of what the pieces of a group are, and of how they were joined."""
-    spans = [
-        f"{alone[k].chunks[0].keyframes[0]}-{alone[k].chunks[-1].keyframes[-1]}"
-        for k in group.pieces
-    ]
+    names = []
+    for number in group.pieces:
+        chunks = alone[number].chunks
+        first, last = (chunks[0].keyframes[0], chunks[-1].keyframes[-1]) if chunks else (0, 0)
+        names.append(f"scans {first}-{last}" if chunks else "the saved map")
     places = min(join.num_places for join in group.joins)
     return (
-        f"scans {' and '.join(spans)} are different drives, or the drive is broken between them: "
-        f"mapped alone, and joined by {places} places that were found again",
+        f"{' and '.join(names)} were mapped alone, and joined by {places} places that were found "
+        "again",
     )
 
 
@@ -278,31 +259,45 @@ def _result(
     keyframe_poses, closures = np.asarray(info.pose, np.float64), None
     online_poses = keyframes.poses_since_keyframes(keyframe_poses, matched.is_keyframe, motion)
     poses = online_poses
+    saved_poses = None if filtered.saved is None else filtered.saved.poses
     if run.smooth:
         own: Any = keyframe_odometry.astype(info.pose.dtype)  # NumPy, like the rest
-        keyframe_poses, belief, closures = smooth_result(
+        measurements, diagnostics = Measurement(own, features, scan_match=matches), info
+        scans = jax.tree.map(lambda x: x[numbers], run.scans) if run.match_scans else None
+        if filtered.saved is not None and scans is not None:
+            measurements, diagnostics, scans = sessions.with_saved_keyframes(
+                filtered.saved, measurements, info, scans
+            )
+        smoothed, belief, closures = smooth_result(
             config,
             run.params,
             filtered.start,
-            Measurement(own, features, scan_match=matches),
-            info,
+            measurements,
+            diagnostics,
             state.belief,
-            jax.tree.map(lambda x: x[numbers], run.scans) if run.match_scans else None,
+            scans,
             guess,
         )
         state = state._replace(belief=belief)
+        num_saved = len(smoothed) - len(keyframe_poses)
+        keyframe_poses = smoothed[num_saved:]
+        if num_saved:
+            saved_poses, closures = smoothed[:num_saved], sessions.of_new(closures, num_saved)
         poses = keyframes.interpolate_poses(
             keyframe_poses, matched.is_keyframe, motion, matched.increments
         )
-    topological_map = online.topological_map(config, state, keyframe_poses)
+    piece = piece_of(filtered.chunks, len(run.scans.hit))
+    drives = np.split(keyframe_poses, np.flatnonzero(np.diff(piece[numbers])) + 1)
+    if saved_poses is not None:
+        drives.insert(0, saved_poses)
+    topological_map = online.topological_map(config, state, trajectories_as_one(drives))
     if matched.matches is not None and config.scan_matching.use_odometry:
         notes += odometry_notes.contradictions(matched.matches)
         notes += odometry_notes.unsigned(matched.matches, matched.odometry)
         notes += odometry_notes.wrong_scale(matched.matches, matched.odometry)
-    piece = _piece_of(filtered.chunks, len(run.scans.hit))
     return SlamResult(
-        _spread(poses, piece >= 0),
-        _spread(online_poses, piece >= 0),
+        spread(poses, piece >= 0),
+        spread(online_poses, piece >= 0),
         numbers,
         state.belief,
         info,
@@ -314,20 +309,5 @@ def _result(
         notes,
         state.arcs,
         piece,
+        saved_poses,
     )
-
-
-def _piece_of(chunks: Sequence[KeyframeChunk], num_scans: int) -> np.ndarray:
-    """Piece (T,) of each scan; -1 for those of no chunk."""
-    piece = np.full(num_scans, -1)
-    for chunk in chunks:
-        end = int(chunk.keyframes[-1]) + 1
-        piece[end - len(chunk.matched.is_keyframe) : end] = chunk.piece
-    return piece
-
-
-def _spread(poses: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Poses (N, 3) of the scans that are one's own (T,), as rows of all (T, 3); NaN elsewhere."""
-    spread = np.full((len(own), 3), np.nan)
-    spread[own] = poses
-    return spread

@@ -7,7 +7,7 @@ Pieces that are joined, by whatever other pieces, are a group: they have one fra
 map. Pieces that no place joins to the rest become maps of their own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ from jaxslam.matching.joining import Join, find_join
 from jaxslam.matching.map_places import JoinSpec, ScanMap
 from jaxslam.pipeline import stages
 from jaxslam.pipeline.stages import KeyframeChunk
+
+SAVED = -1
+"""Number of the saved map that a log goes on in, which is before all pieces."""
 
 JOIN_STD = (0.2, 0.2, 0.02)
 """[m], [m], [rad] std of the motion from piece to piece, as the places found have it."""
@@ -40,7 +43,7 @@ class Group(NamedTuple):
         return tuple(self.frames)
 
 
-def group_pieces(spec: JoinSpec, maps: Sequence[ScanMap]) -> list[Group]:
+def group_pieces(spec: JoinSpec, maps: Mapping[int, ScanMap]) -> list[Group]:
     """Groups of pieces that can be joined, the largest first.
 
     The pieces are compared with the groups so far, the largest ones first, until nothing joins any
@@ -48,9 +51,9 @@ def group_pieces(spec: JoinSpec, maps: Sequence[ScanMap]) -> list[Group]:
 
     Args:
         spec: Options.
-        maps: Of the pieces.
+        maps: Of the pieces, by their number.
     """
-    groups = [Group({k: np.zeros(3)}) for k in range(len(maps))]
+    groups = [Group({k: np.zeros(3)}) for k in maps]
     tried: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
     while True:
         groups.sort(key=lambda group: -_size(maps, group))
@@ -71,14 +74,14 @@ def group_pieces(spec: JoinSpec, maps: Sequence[ScanMap]) -> list[Group]:
             return groups
 
 
-def group_map(maps: Sequence[ScanMap], group: Group) -> ScanMap:
+def group_map(maps: Mapping[int, ScanMap], group: Group) -> ScanMap:
     """All keyframes of a group, in its frame."""
     poses = [compose(frame, maps[k].poses) for k, frame in group.frames.items()]
     scans = stages.concatenate([maps[k].scans for k in group.pieces])
-    return ScanMap(maps[0].lidar, np.concatenate(poses), scans)
+    return ScanMap(maps[group.pieces[0]].lidar, np.concatenate(poses), scans)
 
 
-def _size(maps: Sequence[ScanMap], group: Group) -> int:
+def _size(maps: Mapping[int, ScanMap], group: Group) -> int:
     """Number of keyframes of a group."""
     return sum(len(maps[k].poses) for k in group.pieces)
 

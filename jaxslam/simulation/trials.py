@@ -20,7 +20,7 @@ from jaxslam.pipeline import offline
 from jaxslam.pipeline.arguments import as_params, check_config
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
-from jaxslam.pipeline.offline import SlamResult
+from jaxslam.pipeline.results import SlamResult
 from jaxslam.simulation import arguments
 from jaxslam.simulation.drives import num_scans_of_drive, simulate_episode, simulate_scans
 from jaxslam.simulation.robot import Robot

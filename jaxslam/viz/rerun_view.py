@@ -19,8 +19,8 @@ from jaxslam.filtering.covariance import slot_blocks
 from jaxslam.frontend import lidar
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.offline import SlamResult
 from jaxslam.pipeline.online import ChunkResult, SlamState
+from jaxslam.pipeline.results import SlamResult
 
 
 class RerunView:

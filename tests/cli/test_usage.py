@@ -32,13 +32,18 @@ def test_version(capsys):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["simulate", "--trials", "many"], ["run"], ["fly"], ["simulate", "--labels", "x"]]
+    "arguments", [["simulate", "--trials", "many"], ["fly"], ["simulate", "--labels", "x"]]
 )
 def test_wrong_usage_exits_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main.main(arguments)
     assert stopped.value.code == 2
     assert capsys.readouterr().err
+
+
+def test_a_run_without_a_log_is_one_line(capsys):
+    assert main.main(["run"]) == 2
+    assert capsys.readouterr().err == "jaxslam: error: LOG: is missing; name one log, or several\n"
 
 
 def test_help_says_in_a_line_what_each_command_does(capsys):
@@ -52,7 +57,7 @@ def test_help_says_in_a_line_what_each_command_does(capsys):
 
 OPTIONS = {
     "simulate": "--world --trials --seed --noise --landmarks --labels --out",
-    "run": "--reference --relations --odometry --smooth --no-smooth --noise --scan-topic "
+    "run": "--reference --relations --odometry --smooth --no-smooth --noise --map --scan-topic "
     "--odometry-topic --mount --upside-down --scan-frame --base-frame --odom-frame "
     "--angle-increment --pose-frame --scan --gif --rerun --strict --out",
     "map": "--robot-radius --min-obstacle-size --regions --out",

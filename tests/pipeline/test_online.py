@@ -186,7 +186,10 @@ def test_loop_closures_are_searched_and_smoothed_with(drive, monkeypatch, rounds
     monkeypatch.setattr(loop_closure, "find_loop_closures", find)
     found = online_slam(drive, smooth=True)
     np.testing.assert_allclose(relative(found.poses[1], found.poses[9]), apart + 0.01, atol=1e-4)
-    assert found.loop_closures is closure and len(calls) == rounds <= smoothing_stage.MAX_CLOSURE_ROUNDS
+    assert (
+        found.loop_closures is closure
+        and len(calls) == rounds <= smoothing_stage.MAX_CLOSURE_ROUNDS
+    )
     for poses, args in zip((plain.poses, found.poses), calls, strict=False):
         np.testing.assert_allclose(args[3], poses, atol=1e-3)
         assert args[:3] == (CONFIG.loop_closure, CONFIG.scan_matching, LIDAR)

@@ -1,52 +1,20 @@
 """Drives that are broken: mapped in pieces, and joined where places are found again."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from office_drive import CONFIG, LIDAR, PARAMS, office_drive, take
 
-from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import compose, increments, relative
-from jaxslam.filtering.noise import NoiseParams
 from jaxslam.matching.joining import Join
 from jaxslam.matching.map_places import JoinSpec, ScanMap
 from jaxslam.pipeline import offline, pieces
-from jaxslam.pipeline.config import Config
-from jaxslam.simulation import path_following, ray_casting, worlds
-
-LIDAR = Lidar(num_beams=91, angle_min=-np.pi / 2, angle_increment=np.pi / 90, range_max=10.0)
-CONFIG = Config.for_laser_log(LIDAR)
-PARAMS = NoiseParams.for_laser_log(match_scans=True)
-
-
-def drive(step=0.25):
-    """Poses (T, 3) on the drive through the office, and its scans."""
-    path = path_following.densify(worlds.waypoints("office"))
-    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = np.arange(0.0, along[-1] - 0.3, step)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
-    poses = np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
-    world, keys = worlds.named("office"), jax.random.split(jax.random.key(3), len(poses))
-
-    @jax.jit
-    def cast(keys, poses):
-        def scan(key, pose):
-            return ray_casting.add_range_noise(key, LIDAR, ray_casting.cast(LIDAR, world, pose))
-
-        return jax.vmap(scan)(keys, poses)
-
-    return poses, jax.tree.map(np.asarray, cast(keys, jnp.asarray(poses)))
-
-
-def take(scans, index):
-    return jax.tree.map(lambda x: x[index], scans)
 
 
 @pytest.fixture(scope="module")
 def carried():
     """A drive through the office, whose robot was carried back to where it had been before."""
-    poses, scans = drive()
+    poses, scans = office_drive()
     kept = np.r_[0:170, 120 : len(poses)]
     odometry = increments(poses[kept])
     odometry[170] = 0.0
@@ -95,10 +63,10 @@ def test_groups_have_the_frame_of_their_first_piece(monkeypatch):
     rng = np.random.default_rng(0)
     frames = rng.uniform(-20, 20, (4, 3)) * [1, 1, 0.1]  # of the pieces, in that of the building
     sizes = (3, 9, 5, 7)
-    maps = [
-        ScanMap(LIDAR, rng.uniform(-9, 9, (n, 3)), Scan(np.ones((n, 91)), np.ones((n, 91)) > 0))
-        for n in sizes
-    ]
+    maps = {
+        k: ScanMap(LIDAR, rng.uniform(-9, 9, (n, 3)), Scan(np.ones((n, 91)), np.ones((n, 91)) > 0))
+        for k, n in enumerate(sizes)
+    }
 
     def find_join(_, first, second):
         """Pieces 1 and 3, and both of them with 0, which their sizes tell apart; never piece 2."""

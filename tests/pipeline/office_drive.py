@@ -1,0 +1,38 @@
+"""A drive through the simulated office, for tests of broken drives and of sessions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.scan import Lidar
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import path_following, ray_casting, worlds
+
+LIDAR = Lidar(num_beams=91, angle_min=-np.pi / 2, angle_increment=np.pi / 90, range_max=10.0)
+CONFIG = Config.for_laser_log(LIDAR)
+PARAMS = NoiseParams.for_laser_log(match_scans=True)
+
+
+def office_drive(step=0.25):
+    """Poses (T, 3) on the drive through the office, and its scans."""
+    path = path_following.densify(worlds.waypoints("office"))
+    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    driven = np.arange(0.0, along[-1] - 0.3, step)
+    x, y = (np.interp(driven, along, column) for column in path.T)
+    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
+    poses = np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
+    world, keys = worlds.named("office"), jax.random.split(jax.random.key(3), len(poses))
+
+    @jax.jit
+    def cast(keys, poses):
+        def scan(key, pose):
+            return ray_casting.add_range_noise(key, LIDAR, ray_casting.cast(LIDAR, world, pose))
+
+        return jax.vmap(scan)(keys, poses)
+
+    return poses, jax.tree.map(np.asarray, cast(keys, jnp.asarray(poses)))
+
+
+def take(scans, index):
+    return jax.tree.map(lambda x: x[index], scans)

@@ -124,6 +124,21 @@ def find_join(spec: JoinSpec, first: ScanMap, second: ScanMap) -> Join:
     return join._replace(rival=rival, accepted=accepted)
 
 
+def check_join(spec: JoinSpec, first: ScanMap, second: ScanMap, between: np.ndarray) -> Join:
+    """A transform that is known otherwise, as a join; accepted if the scans of both maps agree.
+
+    Args:
+        spec: Options, of which `max_contradiction` is used.
+        first: A map.
+        second: Another one, by the same scanner.
+        between: (3,) [m, m, rad] frame of the second map, in that of the first.
+    """
+    confirmed, contradicted = compare_maps(_posed(first), _posed(second), between)
+    share = contradicted / max(confirmed + contradicted, 1.0)
+    accepted = confirmed > 0.0 and share <= spec.max_contradiction
+    return Join(between, accepted, 0, 0.0, share, 0.0)
+
+
 def compare_maps(first: PosedScans, second: PosedScans, between: np.ndarray) -> tuple[float, float]:
     """Ends of beams that two maps confirm, and that contradict, where their scans are near.
 

@@ -14,7 +14,7 @@ from jaxslam.core.types import as_float64
 PAUSE = (5.0, 2.0)
 """Least interval between two scans that is a pause: of the median interval, and [s]."""
 
-PAUSE_INLIERS = 0.45
+PAUSE_INLIERS = 0.3
 """Inlier fraction below which the first scan after a pause shows another place."""
 
 BREAK_INLIERS = 0.2

@@ -207,7 +207,9 @@ def _several_pieces(
         start = arguments.as_start(saved.poses[0])
         alone[pieces.SAVED] = _Filtered(start, sessions.resume(run.config, saved), saved)
     results = []
-    for group in pieces.group_pieces(run.config.joining, maps):
+    firsts = {number: piece.chunks[0] for number, piece in alone.items() if piece.chunks}
+    across = {k: x.across_break for k, x in firsts.items() if x.across_break is not None}
+    for group in pieces.group_pieces(run.config.joining, maps, across):
         number, *left = group.pieces
         if left:
             filtered = alone[number]
@@ -238,10 +240,10 @@ def _notes(group: Group, alone: Mapping[int, _Filtered]) -> tuple[str, ...]:
         first, last = (chunks[0].keyframes[0], chunks[-1].keyframes[-1]) if chunks else (0, 0)
         names.append(f"scans {first}-{last}" if chunks else "the saved map")
     places = min(join.num_places for join in group.joins)
-    return (
-        f"{' and '.join(names)} were mapped alone, and joined by {places} places that were found "
-        "again",
-    )
+    how = f"by {places} places that were found again"
+    if places == 0:
+        how = "as scan matching has it across the break"
+    return (f"{' and '.join(names)} were mapped alone, and joined {how}",)
 
 
 def _result(

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.se2_np import compose, relative
-from jaxslam.matching.joining import Join, find_join
+from jaxslam.matching.joining import Join, check_join, find_join
 from jaxslam.matching.map_places import JoinSpec, ScanMap
 from jaxslam.pipeline import stages
 from jaxslam.pipeline.stages import KeyframeChunk
@@ -43,15 +43,19 @@ class Group(NamedTuple):
         return tuple(self.frames)
 
 
-def group_pieces(spec: JoinSpec, maps: Mapping[int, ScanMap]) -> list[Group]:
+def group_pieces(
+    spec: JoinSpec, maps: Mapping[int, ScanMap], across_breaks: Mapping[int, np.ndarray]
+) -> list[Group]:
     """Groups of pieces that can be joined, the largest first.
 
-    The pieces are compared with the groups so far, the largest ones first, until nothing joins any
-    more.
+    The groups so far are compared, the largest ones first, until nothing joins any more. Those that
+    are left are joined as scan matching had it across the break, if the scans of both agree.
 
     Args:
         spec: Options.
         maps: Of the pieces, by their number.
+        across_breaks: (3,) [m, m, rad] motion by scan matching, by the number of the piece after
+            the break, from the last keyframe of the piece before to its first one.
     """
     groups = [Group({k: np.zeros(3)}) for k in maps]
     tried: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
@@ -71,7 +75,30 @@ def group_pieces(spec: JoinSpec, maps: Mapping[int, ScanMap]) -> list[Group]:
                 groups.append(_merged(one, other, join))
                 break
         else:
-            return groups
+            break
+    for number, increment in across_breaks.items():
+        one, other = (next(g for g in groups if k in g.pieces) for k in (number - 1, number))
+        if one is not other:
+            join = _join_across(spec, maps, one, other, number, increment)
+            if join.accepted:
+                groups = [g for g in groups if g is not one and g is not other]
+                groups.append(_merged(one, other, join))
+    return sorted(groups, key=lambda group: -_size(maps, group))
+
+
+def _join_across(
+    spec: JoinSpec,
+    maps: Mapping[int, ScanMap],
+    before: Group,
+    after: Group,
+    number: int,
+    increment: np.ndarray,
+) -> Join:
+    """The join of two groups by the motion to piece `number` from the one before."""
+    last = compose(before.frames[number - 1], maps[number - 1].poses[-1])
+    first = compose(after.frames[number], maps[number].poses[0])
+    between = compose(compose(last, increment), relative(first, np.zeros(3)))
+    return check_join(spec, group_map(maps, before), group_map(maps, after), between)
 
 
 def group_map(maps: Mapping[int, ScanMap], group: Group) -> ScanMap:

@@ -61,6 +61,8 @@ class KeyframeChunk(NamedTuple):
         odometry: (N, 3) [m, m, rad] increments by the wheels from keyframe to keyframe.
         matched: [S] all scans after the last keyframe of the chunk before, up to the last of this.
         piece: Number of the piece of the drive that they belong to, from 0.
+        across_break: (3,) [m, m, rad] motion to the first of them from the scan before, which ends
+            another piece, as scan matching has it; it may be wrong. None where it has nothing.
     """
 
     chunk: Chunk
@@ -68,6 +70,7 @@ class KeyframeChunk(NamedTuple):
     odometry: np.ndarray
     matched: MatchedScans
     piece: int = 0
+    across_break: np.ndarray | None = None
 
 
 class Drive(NamedTuple):
@@ -102,17 +105,19 @@ def keyframe_chunks(
         drive: The log.
     """
     piece, first, before, after, waiting = 0, 0, None, submap, None
+    across_break = None
 
     def complete(count: int) -> Iterator[KeyframeChunk]:
         """The first `count` keyframes that wait, in chunks."""
-        nonlocal first, waiting
+        nonlocal first, waiting, across_break
         assert waiting is not None
         ends, start = np.flatnonzero(waiting.is_keyframe) + 1, 0
         for k in range(0, count, chunks.CHUNK):
             end = int(ends[k : min(k + chunks.CHUNK, count)][-1])
             some = _part(waiting, start, end)
-            yield _extract(config, after, first + start, some, drive.scans, piece)
-            start = end
+            chunk = _extract(config, after, first + start, some, drive.scans)
+            yield chunk._replace(piece=piece, across_break=across_break)
+            start, across_break = end, None
         first, waiting = first + start, _part(waiting, start, None)
 
     def rest() -> Iterator[KeyframeChunk]:
@@ -124,7 +129,7 @@ def keyframe_chunks(
     for part in _match_ahead(config, submap, drive):
         if part.starts_piece:
             yield from rest()
-            piece, before = piece + 1, None
+            piece, before, across_break = piece + 1, None, part.across_break
         after = part.submap
         matched = MatchedScans(np.ones(len(part.odometry), bool), part.odometry, part.matches)
         if part.matches is not None:
@@ -154,7 +159,6 @@ def _extract(
     first: int,
     matched: MatchedScans,
     scans: Scan,
-    piece: int,
 ) -> KeyframeChunk:
     """Start the front end on the keyframes of scans that begin at number `first` of the log."""
     own = matched.is_keyframe
@@ -165,7 +169,7 @@ def _extract(
         matches = keyframes.compose_matches(matched.matches, own)
     some = jax.tree.map(lambda x: x[numbers], scans)
     chunk = chunks.extract_matched(config, submap, odometry, some, matches)
-    return KeyframeChunk(chunk, numbers, odometry, matched, piece)
+    return KeyframeChunk(chunk, numbers, odometry, matched)
 
 
 class _MatchedPart(NamedTuple):
@@ -175,6 +179,7 @@ class _MatchedPart(NamedTuple):
     odometry: np.ndarray
     matches: ScanMatch | None
     starts_piece: bool = False
+    across_break: np.ndarray | None = None
 
 
 def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterator[_MatchedPart]:
@@ -186,6 +191,7 @@ def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterato
         return
 
     latest, is_start = submap, drive.new_drive.copy()
+    across: dict[int, np.ndarray] = {}
     is_start[0] = False
     num_returns = np.asarray(drive.scans.hit).sum(axis=1)
 
@@ -212,10 +218,13 @@ def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterato
             count = len(increments)
             if broken is not None:
                 is_start[start + broken], count = True, broken
+                if matches.inlier_fraction[broken] >= breaks.PAUSE_INLIERS:
+                    across[start + broken] = np.asarray(matches.increment[broken], float)
             if count:
                 matches = jax.tree.map(lambda x, count=count: x[:count], matches)
                 latest = after
-                found.append(_MatchedPart(after, increments[:count], matches, is_start[start]))
+                part = _MatchedPart(after, increments[:count], matches, is_start[start])
+                found.append(part._replace(across_break=across.get(start)))
             start += count
         return found
 

@@ -41,9 +41,9 @@ def test_a_pause_is_an_interval_much_longer_than_usual_and_of_some_seconds():
     [
         ({}, None),
         ({"odometry_weight": (4, 0.1)}, 4),
-        ({"inlier_fraction": (4, 0.4)}, 4),
+        ({"inlier_fraction": (4, 0.25)}, 4),
         ({"odometry_weight": (3, 0.1)}, None),
-        ({"inlier_fraction": (3, 0.4)}, None),
+        ({"inlier_fraction": (3, 0.25)}, None),
         ({"inlier_fraction": (3, 0.1)}, 3),
     ],
 )

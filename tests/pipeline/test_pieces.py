@@ -76,7 +76,7 @@ def test_groups_have_the_frame_of_their_first_piece(monkeypatch):
         return Join(between, 2 not in (one, other), 5, 9.0, 0.0, 0.0)
 
     monkeypatch.setattr(pieces, "find_join", find_join)
-    largest, alone = pieces.group_pieces(JoinSpec(), maps)
+    largest, alone = pieces.group_pieces(JoinSpec(), maps, {})
     assert largest.pieces == (0, 1, 3) and alone.pieces == (2,) and len(largest.joins) == 2
     for number, frame in largest.frames.items():
         np.testing.assert_allclose(frame, relative(frames[0], frames[number]), atol=1e-9)

@@ -10,6 +10,7 @@ map. Pieces that no place joins to the rest become maps of their own.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,6 +22,9 @@ from jaxslam.pipeline.stages import KeyframeChunk
 
 SAVED = -1
 """Number of the saved map that a log goes on in, which is before all pieces."""
+
+NEAR_BREAK = 8.0
+"""[m] from a break up to which scans are compared across it: there is little drift yet."""
 
 JOIN_STD = (0.2, 0.2, 0.02)
 """[m], [m], [rad] std of the motion from piece to piece, as the places found have it."""
@@ -95,10 +99,21 @@ def _join_across(
     increment: np.ndarray,
 ) -> Join:
     """The join of two groups by the motion to piece `number` from the one before."""
-    last = compose(before.frames[number - 1], maps[number - 1].poses[-1])
-    first = compose(after.frames[number], maps[number].poses[0])
-    between = compose(compose(last, increment), relative(first, np.zeros(3)))
-    return check_join(spec, group_map(maps, before), group_map(maps, after), between)
+    last_map, first_map = maps[number - 1], maps[number]
+    end, start = last_map.poses[-1], first_map.poses[0]
+    between = compose(compose(end, increment), relative(start, np.zeros(3)))
+    join = check_join(spec, _near(last_map, end), _near(first_map, start), between)
+    # From the frames of the pieces to those of their groups.
+    frame = compose(before.frames[number - 1], join.transform)
+    inverse = relative(after.frames[number], np.zeros(3))
+    return join._replace(transform=compose(frame, inverse))
+
+
+def _near(scan_map: ScanMap, pose: np.ndarray) -> ScanMap:
+    """The keyframes of a map near a pose (3,)."""
+    near = np.hypot(*(scan_map.poses - pose)[:, :2].T) < NEAR_BREAK
+    scans = jax.tree.map(lambda x: x[near], scan_map.scans)
+    return ScanMap(scan_map.lidar, scan_map.poses[near], scans)
 
 
 def group_map(maps: Mapping[int, ScanMap], group: Group) -> ScanMap:

@@ -76,9 +76,9 @@ class PlaceSpec(NamedTuple):
     max_points: int = 120
     coarse_points: int = 40
     coarse_std: float = 0.4
-    num_views: int = 1536
-    num_coarse: int = 384
-    num_fine: int = 64
+    num_views: int = 1024
+    num_coarse: int = 256
+    num_fine: int = 48
     coarse_gates: tuple[float, ...] = (0.6, 0.45, 0.3)
     fine_gates: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
     std: float = 0.07

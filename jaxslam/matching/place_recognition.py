@@ -59,8 +59,8 @@ class PlaceQuery(NamedTuple):
     """What is looked for, in the frame of the last scan: P points.
 
     Attributes:
-        points: (P, 2) [m] on surfaces.
-        normal: (P, 2) their unit normals, to where they were seen from.
+        points: (P, 2) [m] where beams ended.
+        normal: (P, 2) unit normals of their surfaces, to where they were seen from; 0 if unknown.
         valid: (P,) bool.
         free: (P, F, 2) [m] in free space before each point.
         is_free: (P, F) bool, those of them that exist.
@@ -117,16 +117,20 @@ def make_query(spec: PlaceSpec, lidar: Lidar, scans: Scan, poses: AnyArray) -> P
     ranges = jnp.linalg.norm(ends, axis=-1, keepdims=True)
     share = 1.0 - jnp.array(FREE_BEFORE)[None, None] / jnp.maximum(ranges, 1e-3)
     free = ends[:, :, None] * share[..., None]
-    is_free = (share > 1.0 - MAX_FREE_SHARE) & surfaces.valid[..., None]
+    is_free = (share > 1.0 - MAX_FREE_SHARE) & scans.hit[..., None]
+    on_surface = surfaces.valid[..., None]
+    surfaces = surfaces._replace(
+        points=jnp.where(on_surface, surfaces.points, ends),
+        normal=jnp.where(on_surface, surfaces.normal, 0.0),
+    )
     surfaces = jax.vmap(transform_points)(poses, surfaces)
     free = jax.vmap(transform)(poses, free.reshape(len(poses), -1, 2)).reshape(free.shape)
-    chosen = _evenly(surfaces.valid.ravel(), spec.max_points)
+    chosen = _evenly(scans.hit.ravel(), spec.max_points)
     points, normal, valid = (
-        x.reshape(-1, *x.shape[2:])[chosen]
-        for x in (surfaces.points, surfaces.normal, surfaces.valid)
+        x.reshape(-1, *x.shape[2:])[chosen] for x in (surfaces.points, surfaces.normal, scans.hit)
     )
     free, is_free = (x.reshape(-1, *x.shape[2:])[chosen] for x in (free, is_free))
-    few = jnp.arange(spec.max_points, dtype=jnp.int32) < jnp.sum(surfaces.valid, dtype=jnp.int32)
+    few = jnp.arange(spec.max_points, dtype=jnp.int32) < jnp.sum(scans.hit, dtype=jnp.int32)
     valid = valid & few
     view = view_of_points(points, valid)
     return PlaceQuery(points, normal, valid, free, is_free & few[:, None], view)

@@ -85,6 +85,7 @@ def query_all(keyframes: Keyframes, protocol: str, every: int, bar: tqdm) -> lis
                 "right": bool(_within(truth[number], np.asarray(found.poses[0], float), RIGHT)),
                 "score": float(found.score[0]),
                 "margin": float(found.margin),
+                "certainty": float(found.certainty),
             }
         )
         bar.update()

@@ -60,7 +60,6 @@ class PlaceSpec(NamedTuple):
         coarse_gates: [m] largest distance of a point from its wall, iteration by iteration.
         fine_gates: [m] the same in the second refinement.
         std: [m] of a point's distance from a wall in the final score.
-        line_std: [m] the same across the wall alone.
         num_candidates: C, places that are returned.
         distinct: [m], [rad] beyond which two poses are different places.
         margin_weight: Of the margin in the certainty of a place, see `Places`.
@@ -81,14 +80,13 @@ class PlaceSpec(NamedTuple):
     num_fine: int = 48
     coarse_gates: tuple[float, ...] = (0.6, 0.45, 0.3)
     fine_gates: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
-    std: float = 0.07
-    line_std: float = 0.05
+    std: float = 0.05
     num_candidates: int = 4
     distinct: tuple[float, float] = (0.5, 0.17)
     margin_weight: float = 3.0
     max_margin: float = 0.15
-    min_certainty: float = 0.96
-    min_margin: float = 0.035
+    min_certainty: float = 0.92
+    min_margin: float = 0.03
 
 
 class PlaceIndex(NamedTuple):
@@ -162,7 +160,7 @@ def check_place_spec(spec: PlaceSpec) -> None:
         ValueError: One is out of range; the message names it.
     """
     checks.check_static("spec", spec, PlaceSpec)
-    for field in ("cell", "position_spacing", "coarse_std", "std", "line_std"):
+    for field in ("cell", "position_spacing", "coarse_std", "std"):
         checks.check_positive(f"spec.{field}", getattr(spec, field))
     counts = "max_points coarse_points num_views num_coarse num_fine num_candidates"
     for field in counts.split():
@@ -211,7 +209,6 @@ def _positions(
     index = np.round((around - low) / spec.cell).astype(int)
     index = index.clip(0, np.array(distance.shape) - 1)
     return around[distance[tuple(index.T)] >= spec.min_clearance]
-
 
 
 def _driven(path: np.ndarray, spacing: float) -> np.ndarray:

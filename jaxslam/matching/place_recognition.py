@@ -9,10 +9,11 @@ best with what a scanner would measure there (`place_views`). Those that agree b
 some points of the query, by their distances d from the walls of the map; the best are refined by
 point-to-line ICP, where a cell names the wall of a point, scored again, and refined with all
 points. The final score is the share of the points that lie on walls, less that of what the query
-saw to be free and which is a wall in the map, with the distance e across the wall as well as d:
+saw to be free and which is a wall in the map. Points are on walls by d, which is of cells, and by
+their distance e across the wall, which is exact:
 
-    score = mean (exp(-d^2 / (2 std^2)) + exp(-e^2 / (2 line_std^2))) / 2 over points
-            - mean exp(-d^2 / (2 std^2)) over points of free space
+    score = mean (w(d) + w(e)) / 2 over points - mean w(d) over points of free space
+    w(d) = exp(-d^2 / (2 std^2))
 
 Look-alike places have about the same score. So the difference between the best and the best at any
 other place, the margin, decides with the score whether a place is accepted; the others are returned
@@ -218,18 +219,18 @@ def _coarse_score(
 def _score(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, pose: Array) -> Array:
     """Share of the points on walls, less that of free space that is a wall; ()."""
 
-    def on_wall(distance: Array, std: float) -> Array:
-        return jnp.exp(-0.5 * (distance / std) ** 2)
+    def on_wall(distance: Array) -> Array:
+        return jnp.exp(-0.5 * (distance / spec.std) ** 2)
 
     points = transform(pose, query.points)
     distance = _look_up(spec, index, points, index.distance)
     normal = _look_up(spec, index, points, index.normal)
     across = dot(normal, points - index.origin[None]) - _look_up(spec, index, points, index.offset)
-    on_line = jnp.where(distance < ON_LINE * spec.cell, on_wall(across, spec.line_std), 0.0)
+    on_line = jnp.where(distance < ON_LINE * spec.cell, on_wall(across), 0.0)
     free = transform(pose, query.free.reshape(-1, 2))
-    in_wall = on_wall(_look_up(spec, index, free, index.distance), spec.std)
+    in_wall = on_wall(_look_up(spec, index, free, index.distance))
     return (
-        0.5 * _mean(on_wall(distance, spec.std), query.valid)
+        0.5 * _mean(on_wall(distance), query.valid)
         + 0.5 * _mean(on_line, query.valid)
         - _mean(in_wall, query.is_free.ravel())
     )

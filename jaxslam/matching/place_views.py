@@ -1,4 +1,4 @@
-"""Views of a map: what a scanner would measure at a position, compared with a query at all headings.
+"""Views of a map: what a scanner would measure at a position, compared with a query by heading.
 
 A view is a function of bearing b and range r: how far the first wall is in each direction, with r
 on a logarithmic axis, since a wall twice as far moves half as much when the robot moves a little.
@@ -77,9 +77,9 @@ def cast_rays(cell: float, distance: Array, starts: Array, directions: Array) ->
 
 @partial(jax.jit, static_argnames="cell")
 def views_of_map(cell: float, distance: Array, positions: Array) -> Array:
-    """Spectra (2, K, N, F), real and imaginary, of the views at positions (N, 2) of the grid [m]."""
-    bearing = 2.0 * jnp.pi / NUM_BEARINGS * jnp.arange(NUM_BEARINGS, dtype=jnp.int32)
-    directions = jnp.stack([jnp.cos(bearing), jnp.sin(bearing)], axis=-1)
+    """Spectra (2, K, N, F), real and imaginary, of the views at positions (N, 2) [m] of a grid."""
+    bearing = 2.0 * np.pi / NUM_BEARINGS * np.arange(NUM_BEARINGS)
+    directions = jnp.asarray(np.stack([np.cos(bearing), np.sin(bearing)], axis=-1), distance.dtype)
     starts = jnp.repeat(positions, NUM_BEARINGS, axis=0)
     ranges = cast_rays(cell, distance, starts, jnp.tile(directions, (len(positions), 1)))
     view = jnp.moveaxis(_shares(ranges.reshape(-1, NUM_BEARINGS)), -1, 0)
@@ -101,14 +101,12 @@ def view_of_points(points: Array, valid: Array) -> Array:
 
 
 def agreement(views: Array, query: Array) -> Array:
-    """Agreement (N, B) of views (2, K, N, F) of a map with that of a query (2, K, F), by heading."""
+    """Agreement (N, B) of views (2, K, N, F) of a map with one (2, K, F) of a query, by heading."""
     real = sum(
-        views[0, k] * query[0, k][None] + views[1, k] * query[1, k][None]
-        for k in range(NUM_RANGES)
+        views[0, k] * query[0, k][None] + views[1, k] * query[1, k][None] for k in range(NUM_RANGES)
     )
     imaginary = sum(
-        views[1, k] * query[0, k][None] - views[0, k] * query[1, k][None]
-        for k in range(NUM_RANGES)
+        views[1, k] * query[0, k][None] - views[0, k] * query[1, k][None] for k in range(NUM_RANGES)
     )
     spectrum = jnp.concatenate([real, imaginary], axis=1)
     waves = np.concatenate([_WEIGHT * np.cos(_PHASE), -_WEIGHT * np.sin(_PHASE)])
@@ -118,8 +116,10 @@ def agreement(views: Array, query: Array) -> Array:
 def _shares(ranges: Array) -> Array:
     """Shares (..., K) of the two neighbouring ranges of the axis; they add up to one."""
     low, high = np.log(RANGES)
-    place = (jnp.log(ranges.clip(*RANGES)) - low) * ((NUM_RANGES - 1) / (high - low))
-    return jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(NUM_RANGES, dtype=place.dtype)), 0.0)
+    place = (jnp.log(ranges.clip(*RANGES)) - low) * float((NUM_RANGES - 1) / (high - low))
+    steps = np.arange(NUM_RANGES).reshape((1,) * ranges.ndim + (-1,))
+    steps = jnp.asarray(steps, place.dtype)
+    return jnp.maximum(1.0 - jnp.abs(place[..., None] - steps), 0.0)
 
 
 def _spectrum(view: Array) -> Array:

@@ -39,6 +39,9 @@ GRID_BLOCK = 128
 POSITION_BLOCK = 256
 """The same for the number of positions."""
 
+KEYFRAME_BLOCK = 64
+"""The same for the number of keyframes."""
+
 PATH_GAP = 2.0
 """[m] between two keyframes that follow each other, up to which the robot drove straight."""
 
@@ -130,7 +133,9 @@ def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> 
     scans = checks.as_scans("scans", lidar, scans, (len(poses),))
     if not len(poses) or not np.isfinite(poses).all():
         raise ValueError("poses are those of no keyframe, or not finite")
-    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(poses, float), scans))
+    # The last keyframe again changes nothing, and few numbers of keyframes are compiled.
+    padded = pad_to((poses, scans), to=len(poses) + -len(poses) % KEYFRAME_BLOCK)
+    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(padded[0], float), padded[1]))
     seen = surfaces.valid
     points, normals = (x[seen].astype(float) for x in (surfaces.points, surfaces.normal))
     everything = np.concatenate([points, poses[:, :2]])

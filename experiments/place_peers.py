@@ -1,8 +1,8 @@
 """Two other methods of place recognition, on the queries of `place_recognition`.
 
-**Search**: a correlative search without hypotheses. All positions of the index at all headings,
-3 degrees apart, are scored by the distances of the points from the walls of the map. It gives a
-pose, and the margin to the best one at another place.
+**Search**: a correlative search without hypotheses. All poses of a grid around the positions of the
+index, 0.2 m and 3 degrees apart, are scored by the distances of the points from the walls of the
+map. It gives a pose, not refined, and the margin to the best one at another place.
 
 **Landmark pairs**: histograms of the directions and distances of all pairs of landmarks of a scan,
 the junctions and corners of the front end; a query is compared with each keyframe, at the best
@@ -31,7 +31,7 @@ from jaxslam.matching.place_index import PlaceIndex, PlaceSpec
 from jaxslam.matching.place_recognition import PlaceQuery
 
 NUM_HEADINGS = 120
-SEARCH_STD = 0.2  # [m] of a point's distance from a wall, about half the spacing of positions
+SEARCH_STD = 0.15  # [m] of a point's distance from a wall, about that of poses from the grid
 POINT_STEP = 2  # every second point of a query
 DIRECTIONS = 24  # bins of half a turn: a pair has no order
 PAIR_STEP, PAIR_MAX = 0.5, 15.0  # [m] bin and largest distance of a pair
@@ -52,7 +52,11 @@ def search_everywhere(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> 
     height, width = likelihood.shape
     points, valid = query.points[::POINT_STEP], query.valid[::POINT_STEP]
     count = jnp.maximum(jnp.sum(valid, dtype=points.dtype), 1.0)
-    starts = index.positions - index.origin[None]
+    quarter = spec.position_spacing / 4  # each position of the index stands for four
+    offsets = quarter * jnp.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    positions = (index.positions[:, None] + offsets[None]).reshape(-1, 2)
+    exists = jnp.repeat(index.valid, len(offsets))
+    starts = positions - index.origin[None]
 
     def at_heading(heading: Array) -> Array:
         ends = starts[:, None] + (points @ rotation(heading).T)[None]
@@ -61,10 +65,10 @@ def search_everywhere(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> 
         return jnp.sum(jnp.where(valid[None], found, 0.0), axis=1) / count
 
     headings = jnp.asarray(2 * np.pi / NUM_HEADINGS * np.arange(NUM_HEADINGS), points.dtype)
-    scores = jnp.where(index.valid[None], lax.map(at_heading, headings), -jnp.inf)
+    scores = jnp.where(exists[None], lax.map(at_heading, headings), -jnp.inf)
     best = jnp.argmax(scores)
-    heading, position = headings[best // len(starts)], index.positions[best % len(starts)]
-    near = jnp.linalg.norm(index.positions - position[None], axis=1) < spec.distinct[0]
+    heading, position = headings[best // len(starts)], positions[best % len(starts)]
+    near = jnp.linalg.norm(positions - position[None], axis=1) < spec.distinct[0]
     same = near[None] & (jnp.abs(wrap_angle(headings - heading)) < spec.distinct[1])[:, None]
     score = scores.ravel()[best]
     margin = score - jnp.max(jnp.where(same, -jnp.inf, scores))

@@ -22,7 +22,7 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import compose, relative
 from jaxslam.core.types import Array, Key
 from jaxslam.frontend.lidar import beam_angles
-from jaxslam.matching.place_index import PlaceSpec, build_index
+from jaxslam.matching.place_index import PlaceIndex, PlaceSpec, build_index
 from jaxslam.matching.place_recognition import find_places, make_query
 from jaxslam.simulation import ray_casting
 from jaxslam.simulation.worlds import Box, World, outline
@@ -137,7 +137,7 @@ def scans_of(
     """Scans [N] from poses (N, 3) under conditions."""
     padded = np.pad(walls, ((0, MAX_WALLS - len(walls)), (0, 0)))
     lidar = LIDAR._replace(range_std=how.range_std)
-    ranges = np.asarray(_ranges(jnp.asarray(padded, float), jnp.asarray(poses, float)), float)
+    ranges = np.array(_ranges(jnp.asarray(padded, float), jnp.asarray(poses, float)), float)
     for row in ranges:
         for _ in range(how.people):
             row[:] = np.minimum(row, _person(*rng.uniform(-3.0, 3.0, 2)))
@@ -214,7 +214,7 @@ def summary(rows: list[Numbers]) -> list[Numbers]:
                     "value": value,
                     "queries": len(some),
                     "accepted": len(accepted),
-                    "precision": right / len(accepted) if accepted else np.nan,
+                    "precision": right / len(accepted) if accepted else None,
                     "precision_low": low,
                     "precision_high": high,
                     "recall": right / len(some),
@@ -224,7 +224,10 @@ def summary(rows: list[Numbers]) -> list[Numbers]:
     return found
 
 
-def _answers(rng, plan: Plan, index, number: int, how: Conditions) -> list[Numbers]:
+def _answers(
+    rng: np.random.Generator, plan: Plan, index: PlaceIndex, number: int, how: Conditions
+) -> list[Numbers]:
+    """A row for each of `number` queries in a plan under conditions."""
     poses = viewpoints(rng, plan, number, how)
     key = jax.random.key(int(rng.integers(2**31)))
     scans = scans_of(rng, key, plan.walls, poses, how)

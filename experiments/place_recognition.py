@@ -243,9 +243,10 @@ def text_of(numbers: Numbers) -> str:
             for row in log["timing"]
         ]
     for row in numbers["floor_plans"]["summary"]:
+        precision = "-" if row["precision"] is None else f"{row['precision']:.3f}"
         lines.append(
             f"floor plans, {row['factor']:9} {row['value']:5.2f}: {row['queries']} queries, "
-            f"precision {row['precision']:.3f}, recall {row['recall']:.2f}"
+            f"precision {precision}, recall {row['recall']:.2f}"
         )
     return "\n".join(lines)
 

@@ -118,8 +118,7 @@ def _shares(ranges: Array) -> Array:
     low, high = np.log(RANGES)
     place = (jnp.log(ranges.clip(*RANGES)) - low) * float((NUM_RANGES - 1) / (high - low))
     steps = np.arange(NUM_RANGES).reshape((1,) * ranges.ndim + (-1,))
-    steps = jnp.asarray(steps, place.dtype)
-    return jnp.maximum(1.0 - jnp.abs(place[..., None] - steps), 0.0)
+    return jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.asarray(steps, place.dtype)), 0.0)
 
 
 def _spectrum(view: Array) -> Array:

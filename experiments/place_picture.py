@@ -1,5 +1,6 @@
 """The picture of `place_recognition`, drawn from its JSON file."""
 
+import math
 from pathlib import Path
 
 from experiments import common
@@ -9,7 +10,7 @@ from experiments.place_curves import METHODS, curve
 FACTORS = {
     "range_std": "range noise [m]",
     "offset": "offset of the viewpoint [m]",
-    "heading": "heading to the drive [rad]",
+    "heading": "heading to the drive [deg]",
     "missing": "share of beams missing",
     "people": "people within 3 m",
 }
@@ -37,22 +38,27 @@ def _draw_logs(axes, logs: Numbers) -> None:
             axis.set(xlim=(0, 1.02), ylim=(0.5, 1.02))
         times = log["timing"]
         sizes = [row["keyframes"] for row in times]
-        axes[2].plot(sizes, [row["query_ms"] for row in times], "o-", color=colour, label=name)
+        axes[1].plot([], [], color=colour, label=name)
+        axes[2].plot(sizes, [row["query_ms"] for row in times], "o-", color=colour)
         axes[2].plot(sizes, [row["search_ms"] for row in times], "o--", color=colour)
         axes[2].plot(sizes, [row["pairs_ms"] for row in times], "o:", color=colour)
     for method, style in STYLES.items():
         axes[0].plot([], [], style, color=common.BLACK, label=METHODS[method])
+        axes[2].plot([], [], style, color=common.BLACK, label=METHODS[method])
     axes[0].legend(frameon=False, fontsize=8, loc="lower left")
     axes[2].set(title="time", xlabel="keyframes of the map", ylabel="a query, one core [ms]")
     common.log_scale(axes[2])
+    axes[1].legend(frameon=False, fontsize=8, loc="lower left")
     axes[2].legend(frameon=False, fontsize=8)
+    axes[2].set(ylim=(0.5, 500))
 
 
 def _draw_factor(axis, summary: list[Numbers], factor: str, label: str) -> None:
     rows = [row for row in summary if row["factor"] == factor]
-    values = [row["value"] for row in rows]
+    scale = 180 / math.pi if factor == "heading" else 1.0
+    values = [scale * row["value"] for row in rows]
     known = [row for row in rows if row["precision"] is not None]
-    at = [row["value"] for row in known]
+    at = [scale * row["value"] for row in known]
     precision = [row["precision"] for row in known]
     low = [row["precision"] - row["precision_low"] for row in known]
     high = [row["precision_high"] - row["precision"] for row in known]
@@ -63,6 +69,6 @@ def _draw_factor(axis, summary: list[Numbers], factor: str, label: str) -> None:
     axis.plot(
         values, [row["best_right"] for row in rows], "^:", color=common.BLACK, label="best is right"
     )
-    axis.set(title="floor plans with look-alike rooms", xlabel=label, ylim=(0, 1.04))
+    axis.set(title="floor plans, look-alike rooms", xlabel=label, ylim=(0, 1.04))
     if factor == next(iter(FACTORS)):
         axis.legend(frameon=False, fontsize=8, loc="lower left")

@@ -60,8 +60,8 @@ def _draw_factor(axis, summary: list[Numbers], factor: str, label: str) -> None:
     known = [row for row in rows if row["precision"] is not None]
     at = [scale * row["value"] for row in known]
     precision = [row["precision"] for row in known]
-    low = [row["precision"] - row["precision_low"] for row in known]
-    high = [row["precision_high"] - row["precision"] for row in known]
+    low = [max(row["precision"] - row["precision_low"], 0.0) for row in known]
+    high = [max(row["precision_high"] - row["precision"], 0.0) for row in known]
     axis.errorbar(
         at, precision, [low, high], fmt="o-", color=common.BLUE, capsize=3, label="precision"
     )

@@ -254,7 +254,7 @@ def text_of(numbers: Numbers) -> str:
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    args = common.parse(__doc__, argv, data="", every=4, plans=12)
+    args = common.parse(__doc__, argv, data="", every=4, plans=8)
     if args.every < 1:
         raise InputError(f"{args.every} is too small", field="--every")
     if args.plans < 1:

@@ -42,7 +42,7 @@ POSITION_BLOCK = 256
 KEYFRAME_BLOCK = 64
 """The same for the number of keyframes."""
 
-PATH_GAP = 2.0
+PATH_GAP = 3.0
 """[m] between two keyframes that follow each other, up to which the robot drove straight."""
 
 
@@ -88,7 +88,7 @@ class PlaceSpec(NamedTuple):
     distinct: tuple[float, float] = (0.5, 0.17)
     margin_weight: float = 3.0
     max_margin: float = 0.15
-    min_certainty: float = 0.92
+    min_certainty: float = 0.96
     min_margin: float = 0.03
 
 

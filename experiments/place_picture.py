@@ -45,10 +45,10 @@ def _draw_logs(axes, logs: Numbers) -> None:
     for method, style in STYLES.items():
         axes[0].plot([], [], style, color=common.BLACK, label=METHODS[method])
         axes[2].plot([], [], style, color=common.BLACK, label=METHODS[method])
-    axes[0].legend(frameon=False, fontsize=8, loc="lower left")
+    axes[0].legend(edgecolor="none", framealpha=1.0, fontsize=8, loc="lower left")
     axes[2].set(title="time", xlabel="keyframes of the map", ylabel="a query, one core [ms]")
     common.log_scale(axes[2])
-    axes[1].legend(frameon=False, fontsize=8, loc="lower left")
+    axes[1].legend(edgecolor="none", framealpha=1.0, fontsize=8, loc="lower left")
     axes[2].legend(frameon=False, fontsize=8)
     axes[2].set(ylim=(0.5, 500))
 

@@ -5,10 +5,9 @@ the same for each pose that is tried, however many keyframes have seen the place
 
     surface of a cell: the nearest surface point s of any keyframe, and its normal n
     positions:         free ones on and beside the path, `PlaceSpec.position_spacing` apart
-    directions:        of each position a histogram of the normals of the walls around it
+    views:             what a scanner would measure at each position, see `place_views`
 
-Normals point to where the surface was seen from; so the two sides of a wall are different, and the
-histogram of a corridor repeats after half a turn, that of most rooms only after a whole one.
+Normals point to where the surface was seen from; so the two sides of a wall are different.
 """
 
 from functools import partial
@@ -29,6 +28,7 @@ from jaxslam.matching.oriented_points import (
     towards_scanner,
     transform_points,
 )
+from jaxslam.matching.place_views import views_of_map
 
 MARGIN = 2.0
 """[m] of the grid around all that the keyframes saw."""
@@ -39,8 +39,11 @@ GRID_BLOCK = 128
 POSITION_BLOCK = 256
 """The same for the number of positions."""
 
-DIRECTION_CELL = 1.0
-"""[m] cell in which directions are counted before they are summed around the positions."""
+KEYFRAME_BLOCK = 64
+"""The same for the number of keyframes."""
+
+PATH_GAP = 3.0
+"""[m] between two keyframes that follow each other, up to which the robot drove straight."""
 
 
 class PlaceSpec(NamedTuple):
@@ -51,44 +54,46 @@ class PlaceSpec(NamedTuple):
         position_spacing: [m] between two positions of the index.
         position_offset: [m] from the path up to which there are positions.
         min_clearance: [m] least distance of a position from any wall.
-        direction_bins: Bins of a whole turn of the histograms; a multiple of four.
-        direction_radius: [m] around a position within which walls count.
         max_points: Points of a query.
-        coarse_points: Those of them, evenly spaced, that all poses are scored by.
+        coarse_points: Those of them, evenly spaced, that most poses are scored by.
         coarse_std: [m] of a point's distance from a wall in that score.
-        num_coarse: Poses, those of the best scores, that are refined with these points.
+        num_views: Poses, those whose views agree best, that are scored with these points.
+        num_coarse: Poses, the best of those, that are refined with these points.
         num_fine: Poses, the best of those, that are refined with all points.
         coarse_gates: [m] largest distance of a point from its wall, iteration by iteration.
         fine_gates: [m] the same in the second refinement.
         std: [m] of a point's distance from a wall in the final score.
         num_candidates: C, places that are returned.
         distinct: [m], [rad] beyond which two poses are different places.
-        min_score: Least score of a place that is accepted.
-        min_margin: Least difference of its score from that of any other place.
+        margin_weight: Of the margin in the certainty of a place, see `Places`.
+        max_margin: Margin beyond which certainty does not increase.
+        min_certainty: Least certainty of a place that is accepted.
+        min_margin: Least margin of a place that is accepted.
     """
 
     cell: float = 0.1
     position_spacing: float = 0.4
     position_offset: float = 0.6
     min_clearance: float = 0.2
-    direction_bins: int = 72
-    direction_radius: float = 10.0
     max_points: int = 120
     coarse_points: int = 40
     coarse_std: float = 0.4
-    num_coarse: int = 512
-    num_fine: int = 64
+    num_views: int = 1024
+    num_coarse: int = 256
+    num_fine: int = 48
     coarse_gates: tuple[float, ...] = (0.6, 0.45, 0.3)
-    fine_gates: tuple[float, ...] = (0.2, 0.15, 0.1)
-    std: float = 0.07
+    fine_gates: tuple[float, ...] = (0.2, 0.15, 0.1, 0.1)
+    std: float = 0.05
     num_candidates: int = 4
     distinct: tuple[float, float] = (0.5, 0.17)
-    min_score: float = 0.7
-    min_margin: float = 0.04
+    margin_weight: float = 3.0
+    max_margin: float = 0.15
+    min_certainty: float = 0.96
+    min_margin: float = 0.03
 
 
 class PlaceIndex(NamedTuple):
-    """Index of a map; G x H cells, N positions, B bins of directions.
+    """Index of a map; G x H cells, N positions; K, F as in `place_views`.
 
     Attributes:
         origin: (2,) [m] corner of the grid: cell (i, j) is around origin + cell (i, j).
@@ -96,7 +101,7 @@ class PlaceIndex(NamedTuple):
         normal: (G, H, 2) unit normal of that surface, to where it was seen from.
         offset: (G, H) [m] n^T (s - origin).
         positions: (N, 2) [m] map frame.
-        directions: (N, B) share of the walls around whose normals have each direction, from 0 on.
+        views: (2, K, N, F) spectra of what a scanner would measure there.
         valid: (N,) bool, the positions that exist.
     """
 
@@ -105,7 +110,7 @@ class PlaceIndex(NamedTuple):
     normal: Array
     offset: Array
     positions: Array
-    directions: Array
+    views: Array
     valid: Array
 
 
@@ -128,7 +133,9 @@ def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> 
     scans = checks.as_scans("scans", lidar, scans, (len(poses),))
     if not len(poses) or not np.isfinite(poses).all():
         raise ValueError("poses are those of no keyframe, or not finite")
-    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(poses, float), scans))
+    # The last keyframe again changes nothing, and few numbers of keyframes are compiled.
+    padded = pad_to((poses, scans), to=len(poses) + -len(poses) % KEYFRAME_BLOCK)
+    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(padded[0], float), padded[1]))
     seen = surfaces.valid
     points, normals = (x[seen].astype(float) for x in (surfaces.points, surfaces.normal))
     everything = np.concatenate([points, poses[:, :2]])
@@ -136,17 +143,17 @@ def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> 
     size = GRID_BLOCK * np.ceil((high - low) / spec.cell / GRID_BLOCK).astype(int)
     distance, normal, offset = _nearest_surfaces(spec, size, points - low, normals)
     positions = _positions(spec, poses[:, :2], low, distance)
-    directions = _directions(spec, size * spec.cell, points - low, normals, positions - low)
     padding = -len(positions) % POSITION_BLOCK
     valid = np.arange(len(positions) + padding) < len(positions)
-    positions, directions = pad_to((positions, directions), to=len(valid))
+    positions = pad_to(positions, to=len(valid))
+    table = jnp.asarray(distance, float)
     return PlaceIndex(
         origin=jnp.asarray(low, float),
-        distance=jnp.asarray(distance, float),
+        distance=table,
         normal=jnp.asarray(normal, float),
         offset=jnp.asarray(offset, float),
         positions=jnp.asarray(positions, float),
-        directions=jnp.asarray(directions, float),
+        views=views_of_map(spec.cell, table, jnp.asarray(positions - low, float)),
         valid=jnp.asarray(valid),
     )
 
@@ -158,13 +165,11 @@ def check_place_spec(spec: PlaceSpec) -> None:
         ValueError: One is out of range; the message names it.
     """
     checks.check_static("spec", spec, PlaceSpec)
-    for field in ("cell", "position_spacing", "direction_radius", "coarse_std", "std"):
+    for field in ("cell", "position_spacing", "coarse_std", "std"):
         checks.check_positive(f"spec.{field}", getattr(spec, field))
-    counts = "direction_bins max_points coarse_points num_coarse num_fine num_candidates"
+    counts = "max_points coarse_points num_views num_coarse num_fine num_candidates"
     for field in counts.split():
         checks.check_at_least(f"spec.{field}", getattr(spec, field), 1)
-    if spec.direction_bins % 4:
-        raise ValueError(f"spec.direction_bins is {spec.direction_bins}, not a multiple of 4")
     for field in ("coarse_gates", "fine_gates"):
         for gate in getattr(spec, field):
             checks.check_positive(f"spec.{field}", gate)
@@ -203,7 +208,7 @@ def _positions(
     offsets = spec.position_spacing * np.arange(-steps, steps + 1)
     beside = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1).reshape(-1, 2)
     beside = beside[np.hypot(*beside.T) <= spec.position_offset]
-    cells = np.round(path / spec.position_spacing).astype(int)
+    cells = np.round(_driven(path, spec.position_spacing / 2) / spec.position_spacing).astype(int)
     around = spec.position_spacing * np.unique(cells, axis=0)[:, None] + beside[None]
     around = np.unique(np.round(around.reshape(-1, 2), 6), axis=0)
     index = np.round((around - low) / spec.cell).astype(int)
@@ -211,26 +216,12 @@ def _positions(
     return around[distance[tuple(index.T)] >= spec.min_clearance]
 
 
-def _directions(
-    spec: PlaceSpec,
-    size: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    positions: np.ndarray,
-) -> np.ndarray:
-    """Histograms (N, B) of the directions of normals (M, 2) of points around positions (N, 2)."""
-    shape = *np.ceil(size / DIRECTION_CELL).astype(int) + 1, spec.direction_bins
-    counts = np.zeros(shape)
-    turn = np.arctan2(normals[:, 1], normals[:, 0]) / (2.0 * np.pi)
-    bins = np.round(turn * spec.direction_bins).astype(int) % spec.direction_bins
-    # A surface counts once, however often it was seen.
-    cells = np.unique(np.column_stack([np.round(points / spec.cell).astype(int), bins]), axis=0)
-    place = np.round(cells[:, :2] * spec.cell / DIRECTION_CELL).astype(int)
-    np.add.at(counts, (*place.T, cells[:, 2]), 1.0)
-    reach = int(np.ceil(spec.direction_radius / DIRECTION_CELL))
-    offsets = np.arange(-reach, reach + 1) * DIRECTION_CELL
-    disc = np.hypot(*np.meshgrid(offsets, offsets)) <= spec.direction_radius
-    counts = ndimage.convolve(counts, disc[..., None].astype(float), mode="constant")
-    at = np.round(positions / DIRECTION_CELL).astype(int)
-    found = counts[tuple(at.T)]
-    return found / np.maximum(found.sum(axis=1, keepdims=True), 1.0)
+def _driven(path: np.ndarray, spacing: float) -> np.ndarray:
+    """Points on a path (K, 2) [m], `spacing` apart where its points follow each other closely."""
+    step = np.hypot(*np.diff(path, axis=0).T)
+    pieces = [path]
+    for start, end, length in zip(path[:-1], path[1:], step, strict=True):
+        if spacing < length <= PATH_GAP:
+            share = np.arange(spacing, length, spacing)[:, None] / length
+            pieces.append(start + share * (end - start))
+    return np.concatenate(pieces)

@@ -4,26 +4,24 @@
     places = find_places(spec, index, make_query(spec, lidar, scans, poses))
 
 A query is one scan, or several joined by odometry where one shows too little. Hypotheses are the
-positions of the index, each with the four turns, one a quadrant, by which the wall directions of
-the query agree best with those around the position:
+positions of the index, each with four headings, one a quadrant: those at which the query agrees
+best with what a scanner would measure there (`place_views`). Those that agree best are scored by
+some points of the query, by their distances d from the walls of the map; the best are refined by
+point-to-line ICP, where a cell names the wall of a point, scored again, and refined with all
+points. The final score is the share of the points that lie on walls, less that of what the query
+saw to be free and which is a wall in the map. Points are on walls by d, which is of cells, and by
+their distance e across the wall, which is exact:
 
-    agreement(turn) = sum_b directions(b + turn) query(b)
-
-All of them are scored by some points of the query, by their distances d from the walls of the map;
-the best are refined by point-to-line ICP, where a cell names the wall of a point. The final score
-is the share of the points that lie on walls, less that of what the query saw to be free and which
-is a wall in the map:
-
-    score = mean exp(-d^2 / (2 std^2)) over points - the same over points of free space
+    score = mean (w(d) + w(e)) / 2 over points - mean w(d) over points of free space
+    w(d) = exp(-d^2 / (2 std^2))
 
 Look-alike places have about the same score. So the difference between the best and the best at any
-other place, the margin, decides whether a place is accepted; the others are returned as well.
-The work is the same for all queries, and linear in the positions of the index.
+other place, the margin, decides with the score whether a place is accepted; the others are returned
+as well. The work is the same for all queries, and linear in the positions of the index.
 
 References:
     Olson (2009), Real-time correlative scan matching. Thrun, Burgard, Fox (2005), Probabilistic
-    Robotics, section 6.4: likelihood fields. Censi, Iocchi, Grisetti (2005), Scan matching in the
-    Hough domain: headings from histograms of wall directions.
+    Robotics, section 6.4: likelihood fields.
 """
 
 from functools import partial
@@ -42,6 +40,7 @@ from jaxslam.matching import checks
 from jaxslam.matching.icp import solve
 from jaxslam.matching.oriented_points import oriented_points, towards_scanner, transform_points
 from jaxslam.matching.place_index import PlaceIndex, PlaceSpec, check_place_spec
+from jaxslam.matching.place_views import NUM_BEARINGS, agreement, view_of_points
 
 FREE_BEFORE = (0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
 """[m] before a surface point where the query saw free space."""
@@ -53,15 +52,20 @@ PRIOR_STD = (0.5, 0.1)
 """[m], [rad] std of a hypothesis, which keeps what a corridor does not constrain."""
 
 
+ON_LINE = 2.5
+"""Cells from the nearest surface up to which a point is on its line."""
+
+
 class PlaceQuery(NamedTuple):
     """What is looked for, in the frame of the last scan: P points.
 
     Attributes:
-        points: (P, 2) [m] on surfaces.
-        normal: (P, 2) their unit normals, to where they were seen from.
+        points: (P, 2) [m] where beams ended.
+        normal: (P, 2) unit normals of their surfaces, to where they were seen from; 0 if unknown.
         valid: (P,) bool.
         free: (P, F, 2) [m] in free space before each point.
         is_free: (P, F) bool, those of them that exist.
+        view: (2, K, F) spectrum of the ranges around the last scan, see `place_views`.
     """
 
     points: Array
@@ -69,6 +73,7 @@ class PlaceQuery(NamedTuple):
     valid: Array
     free: Array
     is_free: Array
+    view: Array
 
 
 class Places(NamedTuple):
@@ -78,12 +83,14 @@ class Places(NamedTuple):
         poses: (C, 3) [m, m, rad] map frame.
         score: (C,) at most 1; -inf where there are no more places.
         margin: () score of the first less that of the second.
-        accepted: () bool, whether the first one is the place, by score and margin.
+        certainty: () score of the first + margin_weight min(margin, max_margin).
+        accepted: () bool, whether the first one is the place, by certainty and margin.
     """
 
     poses: Array
     score: Array
     margin: Array
+    certainty: Array
     accepted: Array
 
 
@@ -111,17 +118,23 @@ def make_query(spec: PlaceSpec, lidar: Lidar, scans: Scan, poses: AnyArray) -> P
     ranges = jnp.linalg.norm(ends, axis=-1, keepdims=True)
     share = 1.0 - jnp.array(FREE_BEFORE)[None, None] / jnp.maximum(ranges, 1e-3)
     free = ends[:, :, None] * share[..., None]
-    is_free = (share > 1.0 - MAX_FREE_SHARE) & surfaces.valid[..., None]
+    is_free = (share > 1.0 - MAX_FREE_SHARE) & scans.hit[..., None]
+    on_surface = surfaces.valid[..., None]
+    surfaces = surfaces._replace(
+        points=jnp.where(on_surface, surfaces.points, ends),
+        normal=jnp.where(on_surface, surfaces.normal, 0.0),
+    )
     surfaces = jax.vmap(transform_points)(poses, surfaces)
     free = jax.vmap(transform)(poses, free.reshape(len(poses), -1, 2)).reshape(free.shape)
-    chosen = _evenly(surfaces.valid.ravel(), spec.max_points)
+    chosen = _evenly(scans.hit.ravel(), spec.max_points)
     points, normal, valid = (
-        x.reshape(-1, *x.shape[2:])[chosen]
-        for x in (surfaces.points, surfaces.normal, surfaces.valid)
+        x.reshape(-1, *x.shape[2:])[chosen] for x in (surfaces.points, surfaces.normal, scans.hit)
     )
     free, is_free = (x.reshape(-1, *x.shape[2:])[chosen] for x in (free, is_free))
-    few = jnp.arange(spec.max_points, dtype=jnp.int32) < jnp.sum(surfaces.valid, dtype=jnp.int32)
-    return PlaceQuery(points, normal, valid & few, free, is_free & few[:, None])
+    few = jnp.arange(spec.max_points, dtype=jnp.int32) < jnp.sum(scans.hit, dtype=jnp.int32)
+    valid = valid & few
+    view = view_of_points(points, valid)
+    return PlaceQuery(points, normal, valid, free, is_free & few[:, None], view)
 
 
 @partial(trace_cache.jit, static_argnames=("spec",))
@@ -136,59 +149,37 @@ def find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places
         query: With `spec.max_points` points.
     """
     every = -(-spec.max_points // spec.coarse_points)
-    some = PlaceQuery(*(x[::every] for x in query))
-
-    def coarse_score(std: float, pose: Array) -> Array:
-        distance = _look_up(spec, index, transform(pose, some.points), index.distance)
-        return _mean(1.0 / (1.0 + (distance / std) ** 2) ** 2, some.valid)
-
-    turns = _best_turns(spec, index, query)
-    poses = jnp.concatenate(
-        [jnp.repeat(index.positions, turns.shape[1], axis=0), turns.reshape(-1, 1)], axis=1
+    some = query._replace(
+        points=query.points[::every], normal=query.normal[::every], valid=query.valid[::every]
     )
-    exists = jnp.repeat(index.valid, turns.shape[1])
-    coarse = _Stage(some, spec.coarse_std, spec.num_coarse, spec.coarse_gates)
-    fine = _Stage(query, spec.coarse_std / 2, spec.num_fine, spec.fine_gates)
-    for stage in (coarse, fine):
-        scores = jnp.where(exists, jax.vmap(partial(coarse_score, stage.std))(poses), -jnp.inf)
-        best = lax.top_k(scores, min(stage.size, len(scores)))[1]
-        refine = partial(_refine, spec, index, stage.query, stage.gates)
-        poses, exists = jax.vmap(refine)(poses[best]), exists[best]
+
+    def best_of(std: float, size: int, poses: Array, exists: Array) -> tuple[Array, Array]:
+        scores = jax.vmap(partial(_coarse_score, spec, std, index, some))(poses)
+        best = lax.top_k(jnp.where(exists, scores, -jnp.inf), min(size, len(poses)))[1]
+        return poses[best], exists[best]
+
+    poses, exists = _hypotheses(index, query, spec.num_views)
+    poses, exists = best_of(spec.coarse_std, spec.num_coarse, poses, exists)
+    poses = jax.vmap(partial(_refine, spec, index, some, spec.coarse_gates))(poses)
+    poses, exists = best_of(spec.coarse_std / 2, spec.num_fine, poses, exists)
+    poses = jax.vmap(partial(_refine, spec, index, query, spec.fine_gates))(poses)
     scores = jax.vmap(partial(_score, spec, index, query))(poses)
-    scores = jnp.where(exists, scores, -jnp.inf)
-    poses, scores = _distinct(spec, poses, scores)
+    poses, scores = _distinct(spec, poses, jnp.where(exists, scores, -jnp.inf))
     margin = scores[0] - scores[1] if len(scores) > 1 else scores[0]
-    accepted = (scores[0] >= spec.min_score) & (margin >= spec.min_margin)
-    return Places(poses, scores, margin, accepted)
+    certainty = scores[0] + spec.margin_weight * jnp.minimum(margin, spec.max_margin)
+    accepted = (certainty >= spec.min_certainty) & (margin >= spec.min_margin)
+    return Places(poses, scores, margin, certainty, accepted)
 
 
-class _Stage(NamedTuple):
-    """How the best poses are refined: `size` of them by a score, with the points of a query."""
-
-    query: PlaceQuery
-    std: float
-    size: int
-    gates: tuple[float, ...]
-
-
-def _best_turns(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Array:
-    """Turns (N, 4) [rad] of the query by which its walls agree best with those of positions."""
-    bins = spec.direction_bins
-    direction = jnp.arctan2(query.normal[:, 1], query.normal[:, 0]) * (bins / (2.0 * jnp.pi))
-    # Shares of the two neighbouring bins, so that agreement does not depend on their borders.
-    low = jnp.floor(direction)
-    upper = direction - low
-    bin_of = low.astype(jnp.int32)
-    weight = query.valid.astype(direction.dtype)
-    counts = jnp.zeros(bins, direction.dtype)
-    counts = counts.at[bin_of % bins].add(weight * (1.0 - upper))
-    counts = counts.at[(bin_of + 1) % bins].add(weight * upper)
-    shift = jnp.arange(bins, dtype=jnp.int32)
-    turned = counts[(shift[:, None] - shift[None]) % bins]  # (b, turn): by each turn
-    agreement = (index.directions @ turned).reshape(-1, 4, bins // 4)
-    first = jnp.arange(4, dtype=jnp.int32) * (bins // 4)  # of each quadrant
-    best = first[None] + jnp.argmax(agreement, axis=-1).astype(jnp.int32)
-    return best.astype(direction.dtype) * (2.0 * jnp.pi / bins)
+def _hypotheses(index: PlaceIndex, query: PlaceQuery, size: int) -> tuple[Array, Array]:
+    """Poses (size, 3) whose views agree best, one a quadrant and position; whether they exist."""
+    found = agreement(index.views, query.view).reshape(-1, 4, NUM_BEARINGS // 4)
+    first = jnp.arange(4, dtype=jnp.int32) * (NUM_BEARINGS // 4)  # of each quadrant
+    turns = (first[None] + jnp.argmax(found, axis=-1).astype(jnp.int32)).ravel()
+    scores = jnp.where(index.valid[:, None], jnp.max(found, axis=-1), -jnp.inf).ravel()
+    best = lax.top_k(scores, min(size, len(scores)))[1]
+    turn = turns[best].astype(found.dtype) * (2.0 * jnp.pi / NUM_BEARINGS)
+    return jnp.column_stack([index.positions[best // 4], turn]), scores[best] > -jnp.inf
 
 
 def _refine(
@@ -217,15 +208,31 @@ def _refine(
     return lax.scan(step, start, jnp.array(gates))[0]
 
 
+def _coarse_score(
+    spec: PlaceSpec, std: float, index: PlaceIndex, query: PlaceQuery, pose: Array
+) -> Array:
+    """Share () of the points near walls, by a std [m] of their distances."""
+    distance = _look_up(spec, index, transform(pose, query.points), index.distance)
+    return _mean(1.0 / (1.0 + (distance / std) ** 2) ** 2, query.valid)
+
+
 def _score(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, pose: Array) -> Array:
     """Share of the points on walls, less that of free space that is a wall; ()."""
 
-    def on_wall(points: Array) -> Array:
-        distance = _look_up(spec, index, transform(pose, points), index.distance)
+    def on_wall(distance: Array) -> Array:
         return jnp.exp(-0.5 * (distance / spec.std) ** 2)
 
-    return _mean(on_wall(query.points), query.valid) - _mean(
-        on_wall(query.free.reshape(-1, 2)), query.is_free.ravel()
+    points = transform(pose, query.points)
+    distance = _look_up(spec, index, points, index.distance)
+    normal = _look_up(spec, index, points, index.normal)
+    across = dot(normal, points - index.origin[None]) - _look_up(spec, index, points, index.offset)
+    on_line = jnp.where(distance < ON_LINE * spec.cell, on_wall(across), 0.0)
+    free = transform(pose, query.free.reshape(-1, 2))
+    in_wall = on_wall(_look_up(spec, index, free, index.distance))
+    return (
+        0.5 * _mean(on_wall(distance), query.valid)
+        + 0.5 * _mean(on_line, query.valid)
+        - _mean(in_wall, query.is_free.ravel())
     )
 
 

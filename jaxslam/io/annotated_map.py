@@ -19,6 +19,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.geojson import COUNTERS, KINDS
 
 MAX_ID = 2**31 - 2  # ids are int32, also the one after it
+MAX_COORDINATE = 1e9  # [m]
 
 LINES = ("LineString", "MultiLineString")
 GRAPH_TYPES = ("Point", *LINES)
@@ -66,7 +67,7 @@ class OldEdge(NamedTuple):
 
 
 class OldArc(NamedTuple):
-    """An arc of the file: id, and one or two opposite directions by ascending id."""
+    """An arc of the file: its id, and one or two opposite directions."""
 
     id: int
     edges: tuple[OldEdge, ...]
@@ -143,14 +144,11 @@ def read(path: str | PathLike, kinds: Collection[str] = KINDS) -> AnnotatedMap |
     if not nodes and any(_looks_like_a_node(feature) for feature in own):
         advice = "an editor dropped it: take the file as it was before"
         raise InputError("no Point has metadata.kind", path=path, field="features", advice=advice)
-    arcs = [
-        OldArc(arc, tuple(sorted(pair, key=lambda e: e.id))) for arc, pair in sorted(edges.items())
-    ]
     counters = _counters(path, content.get(COUNTERS, {}))
     others = {"type", "features", "bbox", COUNTERS}  # a bbox is of the old features
     return AnnotatedMap(
         nodes=tuple(nodes),
-        arcs=tuple(arcs),
+        arcs=tuple(OldArc(arc, tuple(pair)) for arc, pair in edges.items()),
         features=tuple(own),
         members={key: value for key, value in content.items() if key not in others},
         next_id=max([counters["next_id"], *(known + 1 for known in ids)]),
@@ -265,7 +263,7 @@ def _line(where: _Place, geometry: Mapping[str, Any]) -> np.ndarray | None:
         line = np.array([[float(p[0]), float(p[1])] for line in lines for p in line])
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):
         line = np.zeros(0)
-    if len(line) < 2:
+    if len(line) < 2 or not (np.abs(line) < MAX_COORDINATE).all():
         raise where.error("geometry.coordinates", "are no points of a line")
     return line
 

@@ -80,6 +80,7 @@ def give(content):
                 feature["properties"][key] = value
     content["crs"] = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
     content["name"] = "first floor"
+    content["bbox"] = [0, 0, 4, 3]  # of the old features: it is left out
     content["features"][3:3] = OWN
 
 
@@ -138,7 +139,9 @@ def test_a_round_trip_keeps_what_a_user_added_exactly(path):
     assert after["features"] == [*ours, *OWN]
     assert json.dumps(after["features"][len(ours) :]) == json.dumps(OWN)
     members = {key: value for key, value in after.items() if key not in ("features", "jaxslam")}
-    assert members == {key: value for key, value in before.items() if key != "features"}
+    assert members == {
+        key: value for key, value in before.items() if key not in ("features", "bbox")
+    }
     again, notes = next_session(path)
     assert notes == () and again == json.loads(path.read_text()) == {**again, **members}
 
@@ -460,6 +463,10 @@ def set_member(number, **values):
         ),
         (
             set_member(3, geometry={"type": "LineString", "coordinates": [[1, 2]]}),
+            "features[3].geometry.coordinates: are no points",
+        ),
+        (
+            set_member(3, geometry={"type": "LineString", "coordinates": [[1, 2], ["nan", 1]]}),
             "features[3].geometry.coordinates: are no points",
         ),
         (

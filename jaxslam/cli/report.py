@@ -15,7 +15,9 @@ from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
 from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map
-from jaxslam.io.geojson import Arc, Node
+from jaxslam.io.annotated_map import AnnotatedMap
+from jaxslam.io.carry_over import carry_over
+from jaxslam.io.geojson import KINDS, Arc, Node
 from jaxslam.io.output import write_json
 from jaxslam.mapping import pose_graph
 from jaxslam.mapping.occupancy import occupancy_map
@@ -27,8 +29,6 @@ from jaxslam.simulation.worlds import World
 from jaxslam.tuning.fitting import TuneResult
 from jaxslam.tuning.parameters import param_names
 
-# Names in map.geojson of the kinds of landmark: junction, corner, wall direction.
-KINDS = ("node", "corner", "wall")
 MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
 
 
@@ -94,8 +94,20 @@ def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
     figure.savefig(path)
 
 
-def write_map(path: Path, graph: TopologicalMap) -> None:
-    """Write a topological map as GeoJSON."""
+def write_map(
+    path: Path, graph: TopologicalMap, old: AnnotatedMap | None = None
+) -> tuple[str, ...]:
+    """Write a topological map as GeoJSON.
+
+    Args:
+        path: File to write.
+        graph: The map.
+        old: Map of the sessions before, as `annotated_map.read` gives it: ids of arcs and what a
+            user added are carried over.
+
+    Returns:
+        Notes on what of `old` could not be kept as it was.
+    """
     nodes = []
     rows = zip(graph.id, graph.xy, graph.kind, graph.clearance, strict=True)
     for node, (x, y), kind, clearance in rows:
@@ -112,7 +124,12 @@ def write_map(path: Path, graph: TopologicalMap) -> None:
         )
         for index, (start, end) in enumerate(graph.arc_ends)
     ]
-    geojson.write(path, nodes, arcs)
+    if old is None:
+        geojson.write(path, nodes, arcs)
+        return ()
+    kept = carry_over(old, nodes, arcs)
+    geojson.write(path, kept.nodes, kept.arcs, features=kept.features, members=kept.members)
+    return kept.notes
 
 
 def draw(

@@ -1,17 +1,26 @@
 """Topological maps as GeoJSON route graphs, in the format that ROS's nav2_route reads.
 
 A node is a Point; an arc, which the robot may drive in both directions, is two directed
-MultiLineStrings.
+MultiLineStrings. `annotated_map` reads what users add to such a file, and `carry_over` takes it and
+the ids of arcs to the next map.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxslam.io.output import write_json
+
+# Kinds of nodes in the file: junction, corner, wall direction.
+KINDS = ("node", "corner", "wall")
+COUNTERS = "jaxslam"
+"""Member of the file: no edge or arc has had an id as high as `next_id` or `next_arc`; absent where
+the features in the file show as much."""
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Node(NamedTuple):
@@ -23,6 +32,7 @@ class Node(NamedTuple):
         y: [m] map frame.
         kind: Kind of landmark.
         clearance: [m] to the nearest wall; left out of the file unless finite.
+        properties: More properties, of the user; ours win.
     """
 
     id: int
@@ -30,6 +40,7 @@ class Node(NamedTuple):
     y: float
     kind: str
     clearance: float
+    properties: Mapping[str, Any] = NOTHING
 
 
 class Arc(NamedTuple):
@@ -42,6 +53,8 @@ class Arc(NamedTuple):
         length: [m].
         clearance: [m] at its narrowest point; left out of the file unless finite.
         points: (k, 2) [m, map frame] polyline from start to end.
+        edges: Ids of the edges from start to end and back; None for those after the highest node.
+        properties: More properties of these two edges, of the user; ours win.
     """
 
     id: int
@@ -50,10 +63,18 @@ class Arc(NamedTuple):
     length: float
     clearance: float
     points: np.ndarray
+    edges: tuple[int, int] | None = None
+    properties: tuple[Mapping[str, Any], Mapping[str, Any]] = (NOTHING, NOTHING)
 
 
 def write(
-    path: str | PathLike, nodes: Sequence[Node], arcs: Sequence[Arc], frame: str = "map"
+    path: str | PathLike,
+    nodes: Sequence[Node],
+    arcs: Sequence[Arc],
+    frame: str = "map",
+    *,
+    features: Sequence[Mapping[str, Any]] = (),
+    members: Mapping[str, Any] = NOTHING,
 ) -> None:
     """Write a map; edge ids follow the highest node id, as nav2_route has one set of ids.
 
@@ -62,6 +83,8 @@ def write(
         nodes: Their ids are distinct.
         arcs: Arcs between them.
         frame: Name of the frame of the coordinates.
+        features: More features, of the user.
+        members: More members of the file, of the user; `name` replaces ours.
 
     Raises:
         ValueError: Something is no `Node` or `Arc`, an id occurs twice or is negative, an arc ends
@@ -70,13 +93,24 @@ def write(
     """
     _check(nodes, arcs)
     first_edge = 1 + max((int(node.id) for node in nodes), default=-1)
-    features = [_node_feature(node, frame) for node in nodes]
+    written = [_node_feature(node, frame) for node in nodes]
     for arc in arcs:
         points = np.asarray(arc.points, np.float64)
         edge = first_edge + 2 * int(arc.id)
-        features.append(_edge_feature(edge, arc.start, arc.end, arc, points))
-        features.append(_edge_feature(edge + 1, arc.end, arc.start, arc, points[::-1]))
-    write_json(path, {"type": "FeatureCollection", "name": "graph", "features": features})
+        there, back = (edge, edge + 1) if arc.edges is None else arc.edges
+        own, own_back = arc.properties
+        written.append(_edge_feature(there, arc.start, arc.end, arc, points, own))
+        written.append(_edge_feature(back, arc.end, arc.start, arc, points[::-1], own_back))
+    _check_ids(written)
+    content = {"type": "FeatureCollection", "name": "graph"} | dict(members)
+    write_json(path, content | {"features": [*written, *features]})
+
+
+def _check_ids(features: Sequence[Mapping[str, Any]]) -> None:
+    """Raise ValueError if an id of a node or edge occurs twice."""
+    ids = [feature["properties"]["id"] for feature in features]
+    if len(set(ids)) != len(ids):
+        raise ValueError(f"ids of nodes and edges must differ: {sorted(ids)}")
 
 
 def _check(nodes: Sequence[Node], arcs: Sequence[Arc]) -> None:
@@ -112,28 +146,40 @@ def _node_feature(node: Node, frame: str) -> dict[str, Any]:
     }
     return {
         "type": "Feature",
-        "properties": properties,
+        "properties": _merged(properties, node.properties),
         "geometry": {"type": "Point", "coordinates": [float(node.x), float(node.y)]},
     }
 
 
 def _edge_feature(
-    edge_id: int, start: int, end: int, arc: Arc, points: np.ndarray
+    edge_id: int, start: int, end: int, arc: Arc, points: np.ndarray, own: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """GeoJSON of one direction of an arc."""
+    """GeoJSON of one direction of an arc, with the user's own properties."""
     length = float(arc.length)
+    properties = {
+        "id": int(edge_id),
+        "startid": int(start),
+        "endid": int(end),
+        "cost": length,
+        "overridable": True,
+        "metadata": {"arc": int(arc.id), "length": length} | _clearance(arc.clearance),
+    }
     return {
         "type": "Feature",
-        "properties": {
-            "id": edge_id,
-            "startid": int(start),
-            "endid": int(end),
-            "cost": length,
-            "overridable": True,
-            "metadata": {"arc": int(arc.id), "length": length} | _clearance(arc.clearance),
-        },
+        "properties": _merged(properties, own),
         "geometry": {"type": "MultiLineString", "coordinates": [points.tolist()]},
     }
+
+
+def _merged(ours: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Our properties with the user's own, objects merged; of other values ours win."""
+    merged = dict(ours) | {key: value for key, value in own.items() if key not in ours}
+    for key in ours.keys() & own.keys():
+        if ours[key] == {}:
+            merged[key] = own[key]
+        elif isinstance(ours[key], Mapping) and isinstance(own[key], Mapping):
+            merged[key] = _merged(ours[key], own[key])
+    return merged
 
 
 def _clearance(value: float) -> dict[str, float]:

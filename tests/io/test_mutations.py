@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import test_carmen
 import test_g2o
+import test_geojson_properties
 import test_map_file
 import test_mrclam
 import test_npz
@@ -18,10 +19,20 @@ import test_ros_map
 from PIL import Image
 
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.io import map_file, mrclam, noise_file, npz, readers, relations, ros_map, tum
+from jaxslam.io import (
+    geojson,
+    map_file,
+    mrclam,
+    noise_file,
+    npz,
+    readers,
+    relations,
+    ros_map,
+    tum,
+)
 from jaxslam.io.errors import InputError
 
-COUNT = 160  # damaged files of each kind: 3,200 of all twenty
+COUNT = 160  # damaged files of each kind
 MEMORY = 2**20  # [kB] that reading them all may take beyond what the tests had before
 HUGE = (b"1e999", b"-1e308", b"9" * 400, b"nan", b"-inf", b"1e-320", b"0", b"-1", b"", b"x\xff\x00")
 
@@ -184,6 +195,17 @@ def map_of(path):
     return ros_map.read(path.with_suffix(".yaml"))
 
 
+def annotated(path):
+    geojson.write(path, test_geojson_properties.NODES, test_geojson_properties.ARCS)
+    test_geojson_properties.edit(path, test_geojson_properties.give)
+    return path
+
+
+def next_map(path):
+    """Whatever is read can be written again."""
+    test_geojson_properties.next_session(path)
+
+
 # How a good file is made, given the path of a new one, and how it is read, given that of the file.
 KINDS = {
     "drive.clf": (lambda p: text(p, test_carmen.good(12)), readers.read_log),
@@ -203,6 +225,7 @@ KINDS = {
     "drive": (lambda p: bag(p, 2), readers.read_log),
     "described": (metadata, parent),
     "map.npz": (saved, map_file.read),
+    "map.geojson": (annotated, next_map),
     "map.yaml": (picture, ros_map.read),
     "map.pgm": (lambda p: picture(p.with_suffix(".yaml")).with_suffix(".pgm"), map_of),
     "drive.tum": (lambda p: text(p, ["0.5 1 2 0 0 0 0.6 0.8"] * 5), tum.read),

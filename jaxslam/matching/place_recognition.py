@@ -9,21 +9,16 @@ the query agree best with those around the position:
 
     agreement(turn) = sum_b directions(b + turn) query(b)
 
-All of them are scored by some points of the query, by their distances d from the walls of the map;
-the best are refined by point-to-line ICP, where a cell names the wall of a point. The final score
-is the share of the points that lie on walls, less that of what the query saw to be free and which
-is a wall in the map:
-
-    score = mean exp(-d^2 / (2 std^2)) over points - the same over points of free space
+All of them are scored by some points of the query, by their distances from the walls of the map;
+the best are refined by point-to-line ICP, and scored by all points (`place_fit` has the formulas).
 
 Look-alike places have about the same score. So the difference between the best and the best at any
 other place, the margin, decides whether a place is accepted; the others are returned as well.
 The work is the same for all queries, and linear in the positions of the index.
 
 References:
-    Olson (2009), Real-time correlative scan matching. Thrun, Burgard, Fox (2005), Probabilistic
-    Robotics, section 6.4: likelihood fields. Censi, Iocchi, Grisetti (2005), Scan matching in the
-    Hough domain: headings from histograms of wall directions.
+    Olson (2009), Real-time correlative scan matching. Censi, Iocchi, Grisetti (2005), Scan matching
+    in the Hough domain: headings from histograms of wall directions.
 """
 
 from functools import partial
@@ -35,12 +30,12 @@ from jax import lax
 
 from jaxslam.core import trace_cache
 from jaxslam.core.scan import Lidar, Scan, check_lidar
-from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
+from jaxslam.core.se2 import transform, wrap_angle
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
-from jaxslam.matching.icp import solve
 from jaxslam.matching.oriented_points import oriented_points, towards_scanner, transform_points
+from jaxslam.matching.place_fit import PlaceQuery, distance_at, fit_pose, mean_of, score_pose
 from jaxslam.matching.place_index import PlaceIndex, PlaceSpec, check_place_spec
 
 FREE_BEFORE = (0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
@@ -49,26 +44,11 @@ FREE_BEFORE = (0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
 MAX_FREE_SHARE = 0.95
 """Share of a range up to which that is: not the scanner itself."""
 
-PRIOR_STD = (0.5, 0.1)
-"""[m], [rad] std of a hypothesis, which keeps what a corridor does not constrain."""
+PRIOR_STD = (0.5, 0.5, 0.1)
+"""[m, m, rad] std of a hypothesis, which keeps what a corridor does not constrain."""
 
-
-class PlaceQuery(NamedTuple):
-    """What is looked for, in the frame of the last scan: P points.
-
-    Attributes:
-        points: (P, 2) [m] on surfaces.
-        normal: (P, 2) their unit normals, to where they were seen from.
-        valid: (P,) bool.
-        free: (P, F, 2) [m] in free space before each point.
-        is_free: (P, F) bool, those of them that exist.
-    """
-
-    points: Array
-    normal: Array
-    valid: Array
-    free: Array
-    is_free: Array
+KERNEL = 0.3
+"""Std of a point's distance from its wall in a refinement, as a fraction of its gate."""
 
 
 class Places(NamedTuple):
@@ -139,8 +119,8 @@ def find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places
     some = PlaceQuery(*(x[::every] for x in query))
 
     def coarse_score(std: float, pose: Array) -> Array:
-        distance = _look_up(spec, index, transform(pose, some.points), index.distance)
-        return _mean(1.0 / (1.0 + (distance / std) ** 2) ** 2, some.valid)
+        distance = distance_at(spec, index, transform(pose, some.points))
+        return mean_of(1.0 / (1.0 + (distance / std) ** 2) ** 2, some.valid)
 
     turns = _best_turns(spec, index, query)
     poses = jnp.concatenate(
@@ -152,9 +132,8 @@ def find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places
     for stage in (coarse, fine):
         scores = jnp.where(exists, jax.vmap(partial(coarse_score, stage.std))(poses), -jnp.inf)
         best = lax.top_k(scores, min(stage.size, len(scores)))[1]
-        refine = partial(_refine, spec, index, stage.query, stage.gates)
-        poses, exists = jax.vmap(refine)(poses[best]), exists[best]
-    scores = jax.vmap(partial(_score, spec, index, query))(poses)
+        poses, exists = jax.vmap(partial(_refine, spec, index, stage))(poses[best]), exists[best]
+    scores = jax.vmap(partial(score_pose, spec, index, query))(poses)
     scores = jnp.where(exists, scores, -jnp.inf)
     poses, scores = _distinct(spec, poses, scores)
     margin = scores[0] - scores[1] if len(scores) > 1 else scores[0]
@@ -191,42 +170,11 @@ def _best_turns(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Array:
     return best.astype(direction.dtype) * (2.0 * jnp.pi / bins)
 
 
-def _refine(
-    spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, gates: tuple[float, ...], start: Array
-) -> Array:
-    """Pose (3,) by point-to-line ICP from a hypothesis."""
-    std = jnp.array([PRIOR_STD[0], PRIOR_STD[0], PRIOR_STD[1]])
-    prior = jnp.diag(1.0 / std**2)
-
-    def step(pose: Array, gate: Array) -> tuple[Array, None]:
-        points = transform(pose, query.points)
-        distance = _look_up(spec, index, points, index.distance)
-        normal = _look_up(spec, index, points, index.normal)
-        offset = _look_up(spec, index, points, index.offset)
-        error = dot(normal, points - index.origin[None]) - offset
-        facing = dot(normal, query.normal @ rotation(pose[2]).T) > 0.5
-        used = query.valid & facing & (distance < gate)
-        weight = jnp.where(used, 1.0 / (1.0 + (error / gate) ** 2) ** 2, 0.0)
-        arm = points - pose[None, :2]
-        by_heading = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
-        columns = jnp.stack([*normal.T, by_heading, error])
-        square = (columns[:3] * weight[None]) @ columns.T / (0.3 * gate) ** 2
-        descent = prior @ (start - pose) - square[:, 3]
-        return pose + solve(square[:, :3] + prior, descent), None
-
-    return lax.scan(step, start, jnp.array(gates))[0]
-
-
-def _score(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, pose: Array) -> Array:
-    """Share of the points on walls, less that of free space that is a wall; ()."""
-
-    def on_wall(points: Array) -> Array:
-        distance = _look_up(spec, index, transform(pose, points), index.distance)
-        return jnp.exp(-0.5 * (distance / spec.std) ** 2)
-
-    return _mean(on_wall(query.points), query.valid) - _mean(
-        on_wall(query.free.reshape(-1, 2)), query.is_free.ravel()
-    )
+def _refine(spec: PlaceSpec, index: PlaceIndex, stage: _Stage, hypothesis: Array) -> Array:
+    """Pose (3,) from a hypothesis (3,)."""
+    stds = tuple(KERNEL * gate for gate in stage.gates)
+    prior = jnp.diag(1.0 / jnp.array(PRIOR_STD) ** 2)
+    return fit_pose(spec, index, stage.query, stage.gates, stds, hypothesis, prior).pose
 
 
 def _distinct(spec: PlaceSpec, poses: Array, scores: Array) -> tuple[Array, Array]:
@@ -243,22 +191,9 @@ def _distinct(spec: PlaceSpec, poses: Array, scores: Array) -> tuple[Array, Arra
     return lax.scan(take, scores, length=spec.num_candidates)[1]
 
 
-def _look_up(spec: PlaceSpec, index: PlaceIndex, points: Array, table: Array) -> Array:
-    """Entries of a table (G, H, ...) at points (N, 2) [m] of the map frame."""
-    cell = jnp.round((points - index.origin[None]) / spec.cell).astype(jnp.int32)
-    height, width = table.shape[:2]
-    return table[cell[:, 0].clip(0, height - 1), cell[:, 1].clip(0, width - 1)]
-
-
 def _evenly(valid: Array, count: int) -> Array:
     """Indices (count,) of those that are valid (N,), evenly spaced among them."""
     total = jnp.sum(valid, dtype=jnp.int32)
     rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
     wanted = jnp.arange(count, dtype=jnp.int32) * jnp.maximum(total, count) // count
     return jnp.searchsorted(rank, wanted).clip(0, len(valid) - 1)
-
-
-def _mean(values: Array, valid: Array) -> Array:
-    """Mean () of the values (N,) that are valid; 0 of none."""
-    total = jnp.sum(jnp.where(valid, values, 0.0))
-    return total / jnp.maximum(jnp.sum(valid, dtype=values.dtype), 1.0)

@@ -1,0 +1,151 @@
+"""Search of the whole map for places that explain the last scans, to be tracked as hypotheses.
+
+A place that is found has the log weight that it would have if it had been tracked for as long as
+the window is, by the joint scores S of the scans in it: with N of them, and against the best
+hypothesis b that is tracked (nowhere, if that is better, or if there is none),
+
+    log_weight = log_weight_b + score_weight N (S - S_b) + found_log_odds
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxslam.core.batching import update_where
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.core.se2 import relative
+from jaxslam.core.types import Array
+from jaxslam.localisation.config import Hypotheses, LocaliseSpec, PlaceMap, Window
+from jaxslam.localisation.hypotheses import keep_best, limited, std_cov, windows_moved
+from jaxslam.matching.place_fit import score_pose
+from jaxslam.matching.place_recognition import find_places, make_query
+
+
+class Found(NamedTuple):
+    """What a search changes: the hypotheses, and the log weight () of nowhere."""
+
+    hypotheses: Hypotheses
+    nowhere: Array
+
+
+def empty_window(spec: LocaliseSpec, lidar: Lidar) -> Window:
+    """A window without scans."""
+    size = spec.window_scans - 1
+    nothing = jnp.zeros((size, lidar.num_beams))
+    return Window(
+        Scan(nothing, nothing > 0.0), jnp.zeros((size, 3)), jnp.zeros(size, bool), jnp.int32(0)
+    )
+
+
+def move_window(window: Window, odometry: Array) -> Window:
+    """The window in the frame after an increment (3,)."""
+    back = relative(odometry, jnp.zeros_like(odometry))
+    heading = window.poses[:, 2]
+    cos, sin = jnp.cos(back[2]), jnp.sin(back[2])
+    x, y = window.poses[:, 0], window.poses[:, 1]
+    poses = jnp.stack(
+        [back[0] + cos * x - sin * y, back[1] + sin * x + cos * y, heading + back[2]], axis=1
+    )
+    return window._replace(poses=poses)
+
+
+def clear_window(window: Window, cleared: Array) -> Window:
+    """The window, without its scans where it is `cleared` () bool."""
+    return window._replace(used=window.used & ~cleared)
+
+
+def add_to_window(spec: LocaliseSpec, window: Window, scan: Scan) -> Window:
+    """The window with the scan that came last, if it is far enough from those in it."""
+    size = spec.window_scans - 1
+    newest = (window.num_added - 1) % size
+    far = windows_moved(spec, window.poses[newest]) >= 1.0
+    new = far | ~jnp.any(window.used)
+    slot = jnp.where(new, window.num_added % size, size)
+
+    def put(held: Array, item: Array) -> Array:
+        return held.at[slot].set(item, mode="drop")
+
+    return Window(
+        jax.tree.map(put, window.scans, scan),
+        put(window.poses, jnp.zeros(3)),
+        put(window.used, jnp.array(True)),
+        window.num_added + new.astype(jnp.int32),
+    )
+
+
+def search_where(
+    spec: LocaliseSpec,
+    lidar: Lidar,
+    wanted: Array,
+    found: Found,
+    place_map: PlaceMap,
+    scan: Scan,
+    window: Window,
+) -> Found:
+    """Hypotheses after a search, where it is `wanted` () bool; cheap where it is not.
+
+    Args:
+        spec: Options.
+        lidar: The scanner of the robot.
+        wanted: () bool.
+        found: Hypotheses that are tracked.
+        place_map: The map.
+        scan: The last scan.
+        window: Those before.
+    """
+    update = partial(_search, spec, lidar)
+    return update_where(wanted, update, found, place_map, scan, window, block=spec.search_block)
+
+
+def _search(
+    spec: LocaliseSpec,
+    lidar: Lidar,
+    tracked: Found,
+    place_map: PlaceMap,
+    scan: Scan,
+    window: Window,
+) -> Found:
+    """Hypotheses after a search."""
+    own = tracked.hypotheses
+    scans = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), window.scans, scan)
+    used = jnp.append(window.used, True)
+    scans = scans._replace(hit=scans.hit & used[:, None])
+    query = make_query(spec.place, lidar, scans, jnp.append(window.poses, jnp.zeros((1, 3)), 0))
+    places = find_places(spec.place, place_map.index, query)
+    score_of = partial(score_pose, spec.place, place_map.index, query)
+    # The last "hypothesis" is nowhere.
+    weights = jnp.append(own.log_weight, tracked.nowhere)
+    scores = jnp.append(jax.vmap(score_of)(own.poses), spec.nowhere_score)
+    best = jnp.argmax(weights)
+    weight = spec.score_weight * jnp.sum(used, dtype=scores.dtype)
+    log_weight = weights[best] + weight * (places.score - scores[best]) + spec.found_log_odds
+    count = len(places.score)
+    candidates = Hypotheses(
+        places.poses,
+        jnp.broadcast_to(std_cov(spec.start_std), (count, 3, 3)),
+        log_weight,
+        places.score,
+        jnp.zeros(count),
+    )
+    pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), own, candidates)
+    return Found(*limited(spec, keep_best(spec, pool), tracked.nowhere))
+
+
+def is_wanted(
+    spec: LocaliseSpec, *, lost: Array, newly: Array, sure: Array, distance: Array, scans: Array
+) -> Array:
+    """Whether a robot is to be looked for; () bool.
+
+    Args:
+        spec: Options.
+        lost: () bool, no hypothesis explains the last scan.
+        newly: () bool, and that was not so at the scan before.
+        sure: () bool.
+        distance: () [m] driven since the last search.
+        scans: () int32 scans since the last search.
+    """
+    unsure_distance, sure_distance = spec.search_distance
+    due = jnp.where(sure, distance >= sure_distance, distance >= unsure_distance)
+    return due | (lost & (newly | (scans >= spec.lost_scans)))

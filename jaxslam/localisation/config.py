@@ -33,9 +33,9 @@ class LocaliseSpec(NamedTuple):
             tracked, where they explain the last scans equally well.
         lost_score: Score below which the best hypothesis does not explain a scan.
         lost_scans: Scans after which a robot that is lost and does not move is looked for again.
-        search_distance: [m] driven after which the robot is looked for again: while it is not
-            sure, and when it is.
-        sure: Probability from which on it is.
+        search_share: Share of the path since the pose was found after which the map is searched
+            again,
+        search_distance: [m] but no less and no more than these.
         search_block: Robots of a batch that are looked for at once.
     """
 
@@ -51,14 +51,14 @@ class LocaliseSpec(NamedTuple):
     window_distance: tuple[float, float] = (0.5, 0.5)
     score_weight: float = 40.0
     memory: float = 0.9
-    nowhere_score: float = 0.5
+    nowhere_score: float = 0.6
     max_log_odds: float = 20.0
     given_log_odds: float = 10.0
     found_log_odds: float = -4.0
     lost_score: float = 0.5
     lost_scans: int = 10
+    search_share: float = 0.25
     search_distance: tuple[float, float] = (0.5, 10.0)
-    sure: float = 0.9
     search_block: int = 32
 
 
@@ -170,7 +170,7 @@ def check_localise_spec(spec: LocaliseSpec) -> None:
     for field in (*pairs.split(), "gates"):
         for value in getattr(spec, field):
             checks.check_positive(f"spec.{field}", value)
-    for field in ("score_weight", "max_log_odds"):
+    for field in ("score_weight", "max_log_odds", "search_share"):
         checks.check_positive(f"spec.{field}", getattr(spec, field))
     if not 0.0 <= spec.memory <= 1.0:
         raise ValueError(f"spec.memory is {spec.memory}, not 0 to 1")

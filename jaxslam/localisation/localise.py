@@ -212,12 +212,11 @@ def _step(
     window = clear_window(move_window(state.window, odometry), newly)
     tracked = keep_best(spec, tracked)
     distance = state.searched_distance + jnp.hypot(odometry[0], odometry[1])
-    before = _info(spec, place_map, query, Found(tracked, nowhere))
     searched = shows & is_wanted(
         spec,
         lost=lost,
         newly=newly,
-        sure=before.probability > spec.sure,
+        driven=tracked.driven[0],
         distance=distance,
         scans=state.searched_scans + 1,
     )

@@ -134,18 +134,21 @@ def _search(
 
 
 def is_wanted(
-    spec: LocaliseSpec, *, lost: Array, newly: Array, sure: Array, distance: Array, scans: Array
+    spec: LocaliseSpec, *, lost: Array, newly: Array, driven: Array, distance: Array, scans: Array
 ) -> Array:
     """Whether a robot is to be looked for; () bool.
+
+    The longer its pose has been tracked, the rarer is the search; each is another chance to find
+    a place that explains more.
 
     Args:
         spec: Options.
         lost: () bool, no hypothesis explains the last scan.
         newly: () bool, and that was not so at the scan before.
-        sure: () bool.
+        driven: () [m] since the best hypothesis was found.
         distance: () [m] driven since the last search.
         scans: () int32 scans since the last search.
     """
-    unsure_distance, sure_distance = spec.search_distance
-    due = jnp.where(sure, distance >= sure_distance, distance >= unsure_distance)
+    least, most = spec.search_distance
+    due = distance >= jnp.clip(spec.search_share * driven, least, most)
     return due | (lost & (newly | (scans >= spec.lost_scans)))

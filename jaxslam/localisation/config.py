@@ -66,11 +66,11 @@ class PlaceMap(NamedTuple):
     """What localisation needs of a map.
 
     Attributes:
-        index: Where its walls are, and where a robot may stand.
+        places: Index: where its walls are, and where a robot may stand.
         range_max: () [m] reach of the scanner that made it; what a robot sees beyond is not used.
     """
 
-    index: PlaceIndex
+    places: PlaceIndex
     range_max: Array
 
 

@@ -70,12 +70,12 @@ def fit(
 
     def of_one(pose: Array, cov: Array) -> tuple[Array, Array, Array]:
         prior = inverse(cov)
-        found = fit_pose(spec.place, place_map.index, query, spec.gates, stds, pose, prior)
+        found = fit_pose(spec.place, place_map.places, query, spec.gates, stds, pose, prior)
         after = inverse(prior + found.information)
         good = jnp.all(jnp.isfinite(found.pose)) & jnp.all(jnp.isfinite(after))
         pose = jnp.where(good, found.pose, pose)
         pose = pose.at[2].set(wrap_angle(pose[2]))
-        score = score_pose(spec.place, place_map.index, query, pose)
+        score = score_pose(spec.place, place_map.places, query, pose)
         return pose, jnp.where(good, after, cov), score
 
     poses, cov, scores = jax.vmap(of_one)(hypotheses.poses, hypotheses.cov)

@@ -81,10 +81,25 @@ def make_map(spec: LocaliseSpec, saved_map: SavedMap) -> PlaceMap:
     Raises:
         ValueError: An option is out of range, or the map has no keyframe.
     """
+    return map_of_scans(spec, saved_map.lidar, saved_map.poses, saved_map.scans)
+
+
+def map_of_scans(spec: LocaliseSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> PlaceMap:
+    """The same of scans at known poses.
+
+    Args:
+        spec: Options.
+        lidar: The scanner that made them.
+        poses: (K, 3) [m, m, rad] of the scanner, map frame.
+        scans: [K].
+
+    Raises:
+        ValueError: An option is out of range, or poses and scans are not K >= 1 each, those of
+            this lidar, and finite.
+    """
     check_localise_spec(spec)
-    lidar = saved_map.lidar
-    index = build_index(spec.place, lidar, saved_map.poses, saved_map.scans)
-    return PlaceMap(index, jnp.asarray(lidar.range_max, float))
+    places = build_index(spec.place, lidar, poses, scans)
+    return PlaceMap(places, jnp.asarray(lidar.range_max, float))
 
 
 def init(spec: LocaliseSpec, lidar: Lidar, pose: Any = None) -> LocaliseState:
@@ -238,7 +253,7 @@ def _info(spec: LocaliseSpec, place_map: PlaceMap, query: PlaceQuery, found: Fou
     own = found.hypotheses
     exists = jnp.isfinite(own.log_weight)
     odds = log_odds(spec, own, found.nowhere)
-    scan_score = score_pose(spec.place, place_map.index, query, own.poses[0])
+    scan_score = score_pose(spec.place, place_map.places, query, own.poses[0])
     values = features(odds, own.score[0], scan_score, own.driven[0], widest_std(own.cov[0]))
     return LocaliseInfo(
         own.poses[0],

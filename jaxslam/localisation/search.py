@@ -113,8 +113,8 @@ def _search(
     used = jnp.append(window.used, True)
     scans = scans._replace(hit=scans.hit & used[:, None])
     query = make_query(spec.place, lidar, scans, jnp.append(window.poses, jnp.zeros((1, 3)), 0))
-    places = find_places(spec.place, place_map.index, query)
-    score_of = partial(score_pose, spec.place, place_map.index, query)
+    places = find_places(spec.place, place_map.places, query)
+    score_of = partial(score_pose, spec.place, place_map.places, query)
     # The last "hypothesis" is nowhere.
     weights = jnp.append(own.log_weight, tracked.nowhere)
     scores = jnp.append(jax.vmap(score_of)(own.poses), spec.nowhere_score)

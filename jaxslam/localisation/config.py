@@ -59,7 +59,7 @@ class LocaliseSpec(NamedTuple):
     lost_scans: int = 10
     search_share: float = 0.25
     search_distance: tuple[float, float] = (0.5, 10.0)
-    search_block: int = 32
+    search_block: int = 8
 
 
 class PlaceMap(NamedTuple):

@@ -235,7 +235,9 @@ def _step(
         distance=distance,
         scans=state.searched_scans + 1,
     )
-    found = search_where(spec, lidar, searched, Found(tracked, nowhere), place_map, scan, window)
+    found = search_where(
+        spec, lidar, searched, Found(tracked, nowhere), place_map, scan, query, window
+    )
     info = _info(spec, place_map, query, found)._replace(searched=searched)
     state = LocaliseState(
         found.hypotheses,

@@ -5,6 +5,8 @@ the window is, by the joint scores S of the scans in it: with N of them, and aga
 hypothesis b that is tracked (nowhere, if that is better, or if there is none),
 
     log_weight = log_weight_b + score_weight N (S - S_b) + found_log_odds
+
+A place that is tracked already stays as it is, unless what was found has the larger log weight.
 """
 
 from functools import partial
@@ -18,9 +20,16 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import relative
 from jaxslam.core.types import Array
 from jaxslam.localisation.config import Hypotheses, LocaliseSpec, PlaceMap, Window
-from jaxslam.localisation.hypotheses import keep_best, limited, std_cov, windows_moved
-from jaxslam.matching.place_fit import score_pose
-from jaxslam.matching.place_recognition import find_places, make_query
+from jaxslam.localisation.hypotheses import (
+    fit,
+    inverse,
+    keep_best,
+    limited,
+    std_cov,
+    windows_moved,
+)
+from jaxslam.matching.place_fit import PlaceQuery, fit_pose, score_pose
+from jaxslam.matching.place_recognition import KERNEL, find_places, make_query
 
 
 class Found(NamedTuple):
@@ -82,6 +91,7 @@ def search_where(
     found: Found,
     place_map: PlaceMap,
     scan: Scan,
+    of_scan: PlaceQuery,
     window: Window,
 ) -> Found:
     """Hypotheses after a search, where it is `wanted` () bool; cheap where it is not.
@@ -93,10 +103,12 @@ def search_where(
         found: Hypotheses that are tracked.
         place_map: The map.
         scan: The last scan.
+        of_scan: The query of it alone.
         window: Those before.
     """
     update = partial(_search, spec, lidar)
-    return update_where(wanted, update, found, place_map, scan, window, block=spec.search_block)
+    given = place_map, scan, of_scan, window
+    return update_where(wanted, update, found, *given, block=spec.search_block)
 
 
 def _search(
@@ -105,6 +117,7 @@ def _search(
     tracked: Found,
     place_map: PlaceMap,
     scan: Scan,
+    of_scan: PlaceQuery,
     window: Window,
 ) -> Found:
     """Hypotheses after a search."""
@@ -114,10 +127,10 @@ def _search(
     scans = scans._replace(hit=scans.hit & used[:, None])
     query = make_query(spec.place, lidar, scans, jnp.append(window.poses, jnp.zeros((1, 3)), 0))
     places = find_places(spec.place, place_map.places, query)
-    score_of = partial(score_pose, spec.place, place_map.places, query)
     # The last "hypothesis" is nowhere.
     weights = jnp.append(own.log_weight, tracked.nowhere)
-    scores = jnp.append(jax.vmap(score_of)(own.poses), spec.nowhere_score)
+    score_of = jax.vmap(partial(_window_score, spec, place_map, query))
+    scores = jnp.append(score_of(own.poses), spec.nowhere_score)
     best = jnp.argmax(weights)
     weight = spec.score_weight * jnp.sum(used, dtype=scores.dtype)
     log_weight = weights[best] + weight * (places.score - scores[best]) + spec.found_log_odds
@@ -129,8 +142,19 @@ def _search(
         places.score,
         jnp.zeros(count),
     )
+    # The window is as good as the odometry: the last scan alone says where the robot is now.
+    candidates = fit(spec, place_map, of_scan, candidates)[0]
     pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), own, candidates)
     return Found(*limited(spec, keep_best(spec, pool), tracked.nowhere))
+
+
+def _window_score(spec: LocaliseSpec, place_map: PlaceMap, query: PlaceQuery, pose: Array) -> Array:
+    """Score () of the scans of the window at a pose (3,), fitted to them as those found are."""
+    place = spec.place
+    stds = tuple(KERNEL * gate for gate in place.fine_gates)
+    prior = inverse(std_cov(spec.start_std))
+    fitted = fit_pose(place, place_map.places, query, place.fine_gates, stds, pose, prior)
+    return score_pose(place, place_map.places, query, fitted.pose)
 
 
 def is_wanted(

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam.core.batching import pad_to
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import compose, increments, relative
 from jaxslam.localisation import LocaliseSpec, init, map_of_scans, run_steps, step
@@ -53,10 +54,13 @@ def beside(drive, start, seed):
     return poses, odometry
 
 
-def run(place_map, poses, odometry, pose=None, lidar=LIDAR, seed=1):
-    scans, count = scans_of(lidar, poses, seed), jnp.int32(len(poses))
-    state = init(SPEC, lidar, pose)
-    return run_steps(SPEC, lidar, place_map, state, scans, jnp.asarray(odometry), count)
+def run(place_map, poses, odometry, pose=None, lidar=LIDAR):
+    """State and infos [T] of a drive; padded, so that all drives are one program."""
+    count, scans = len(poses), scans_of(lidar, poses, 1)
+    scans, odometry = pad_to((scans, jnp.asarray(odometry)), to=2 * NUM_STEPS)
+    given = init(SPEC, lidar, pose), scans, odometry, jnp.int32(count)
+    state, infos = run_steps(SPEC, lidar, place_map, *given)
+    return state, jax.tree.map(lambda x: np.asarray(x)[:count], infos)
 
 
 def is_right(info, poses, limits=RIGHT):
@@ -64,6 +68,7 @@ def is_right(info, poses, limits=RIGHT):
     return (np.hypot(off[:, 0], off[:, 1]) < limits[0]) & (np.abs(off[:, 2]) < limits[1])
 
 
+one_step = jax.jit(step, static_argnums=(0, 1))
 STARTS = [3, 25, 47, 80, 110]
 
 
@@ -85,7 +90,7 @@ def test_a_robot_that_is_carried_is_lost_and_found_again(drive, place_map):
 
 def test_a_start_that_is_known_needs_no_search(drive, place_map):
     poses, odometry = beside(drive, 25, seed=5)
-    info = run(place_map, poses, odometry, pose=compose(poses[0], [0.2, -0.2, 0.1]))[1]
+    info = run(place_map, poses, odometry, pose=compose(poses[0], np.array([0.2, -0.2, 0.1])))[1]
     assert is_right(info, poses).all() and not np.asarray(info.searched)[0]
 
 
@@ -101,13 +106,12 @@ def test_a_robot_outside_of_the_map_is_not_sure(drive):
     place_map = map_of_scans(SPEC, LIDAR, part, scans_of(LIDAR, part))
     poses, odometry = beside(drive, 100, seed=6)
     assert np.hypot(*(poses[:, None, :2] - part[None, :, :2]).T).min() > 2.0
-    info = run(place_map, poses, odometry)[1]
-    assert (np.asarray(info.probability) < 0.9).all()
+    assert (run(place_map, poses, odometry)[1].probability < 0.9).all()
 
 
 def test_localisation_moves_with_the_map(drive, place_map):
     poses, odometry = beside(drive, 47, seed=47)
-    move = np.array([31.0, -12.0, 2.1])
+    move = np.array([31.0, -12.0, np.pi])
     moved = map_of_scans(SPEC, LIDAR, compose(move, drive), scans_of(LIDAR, drive))
     info = run(moved, poses, odometry)[1]
     assert is_right(info, compose(move, poses), (0.1, 0.02))[-5:].all()
@@ -134,8 +138,14 @@ def run_all(place_map, scans, odometry):
     return jax.lax.scan(body, states, by_time)[1]
 
 
-def test_robots_are_found_anywhere_and_tracked(drive, place_map, robots):
-    info = run_all(place_map, *robots)
+@pytest.fixture(scope="module")
+def together(place_map, robots):
+    """Their infos [T, B]."""
+    return run_all(place_map, *robots)
+
+
+def test_robots_are_found_anywhere_and_tracked(drive, together):
+    info = together
     poses = np.stack([beside(drive, start, seed=start)[0] for start in STARTS], axis=1)
     off = relative(poses, np.asarray(info.pose))
     distance, angle = np.hypot(off[..., 0], off[..., 1]), np.abs(off[..., 2])
@@ -146,41 +156,44 @@ def test_robots_are_found_anywhere_and_tracked(drive, place_map, robots):
     assert np.percentile(angle[sure], 95) < np.radians(1.0)
 
 
-def test_a_batch_is_the_same_as_its_robots_one_after_the_other(place_map, robots):
+def test_a_batch_is_the_same_as_its_robots_one_after_the_other(place_map, robots, together):
     scans, odometry = robots
-    together = run_all(place_map, scans, odometry)
     assert len(np.unique(np.asarray(together.searched).sum(axis=1))) > 1  # some robots, not all
     for k in range(len(odometry)):
-        own = jax.tree.map(lambda x: x[k], scans)  # noqa: B023
-        count = jnp.int32(NUM_STEPS)
-        alone = run_steps(SPEC, LIDAR, place_map, init(SPEC, LIDAR), own, odometry[k], count)[1]
-        for of_all, of_one in zip(together, alone, strict=True):
-            np.testing.assert_allclose(of_all[:, k], of_one, atol=1e-6)
+        state = init(SPEC, LIDAR)
+        for t in range(NUM_STEPS):
+            scan = jax.tree.map(lambda x: x[k, t], scans)  # noqa: B023
+            state, alone = one_step(SPEC, LIDAR, place_map, state, scan, odometry[k, t])
+            for of_all, of_one in zip(together, alone, strict=True):
+                np.testing.assert_allclose(of_all[t, k], of_one, atol=1e-6)
 
 
-def test_what_is_not_finite_stays_with_its_robot(place_map, robots):
+def test_what_is_not_finite_stays_with_its_robot(place_map, robots, together):
     scans, odometry = robots
     bad = Scan(scans.ranges.at[1, 4].set(jnp.nan), scans.hit.at[1, 4].set(True))
     hurt = run_all(place_map, bad, odometry.at[1, 6].set(jnp.nan))
-    for before, after in zip(run_all(place_map, scans, odometry), hurt, strict=True):
+    for before, after in zip(together, hurt, strict=True):
         assert np.isfinite(after).all()
         np.testing.assert_array_equal(np.delete(after, 1, axis=1), np.delete(before, 1, axis=1))
     assert hurt.probability[-1, 1] > 0.9  # and found again
 
 
-def test_padding_leaves_the_state(place_map, robots):
-    scans, odometry = jax.tree.map(lambda x: x[0], robots)
-    all_of_them = run_steps(SPEC, LIDAR, place_map, init(SPEC, LIDAR), scans, odometry, 5)[0]
-    some = jax.tree.map(lambda x: x[:5], scans)
-    five = run_steps(SPEC, LIDAR, place_map, init(SPEC, LIDAR), some, odometry[:5], 5)[0]
-    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-9), all_of_them, five)
+def test_padding_leaves_the_state(drive, place_map):
+    poses, odometry = beside(drive, 25, seed=5)
+    scans, odometry = scans_of(LIDAR, np.tile(poses, (2, 1))), np.tile(odometry, (2, 1))
+    given = place_map, init(SPEC, LIDAR), scans, jnp.asarray(odometry), jnp.int32(5)
+    padded = run_steps(SPEC, LIDAR, *given)[0]
+    state = init(SPEC, LIDAR)
+    for k in range(5):
+        scan = jax.tree.map(lambda x: x[k], scans)  # noqa: B023
+        state, _ = one_step(SPEC, LIDAR, place_map, state, scan, odometry[k])
+    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-9), padded, state)
 
 
-def test_a_scan_without_any_return_is_no_evidence(place_map, robots):
-    scans, odometry = jax.tree.map(lambda x: x[0], robots)
-    state = run_steps(SPEC, LIDAR, place_map, init(SPEC, LIDAR), scans, odometry, NUM_STEPS)[0]
+def test_a_scan_without_any_return_is_no_evidence(drive, place_map):
+    state = run(place_map, *beside(drive, 25, seed=5))[0]
     nothing = Scan(jnp.full(LIDAR.num_beams, LIDAR.range_max), jnp.zeros(LIDAR.num_beams, bool))
-    after, info = step(SPEC, LIDAR, place_map, state, nothing, jnp.array([0.2, 0.0, 0.0]))
+    after, info = one_step(SPEC, LIDAR, place_map, state, nothing, jnp.array([0.2, 0.0, 0.0]))
     assert not info.searched and not after.lost
     np.testing.assert_array_equal(after.hypotheses.log_weight, state.hypotheses.log_weight)
 

@@ -199,7 +199,7 @@ def draw_localisation(path: Path, saved_map: SavedMap, infos: LocaliseInfo) -> N
     """Draw the poses of a log, by their probability, over the walls of a map."""
     from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
 
-    scans = jax.tree.map(jnp.asarray, saved_map.scans)
+    scans = saved_map.scans._replace(ranges=jnp.asarray(saved_map.scans.ranges, float))
     points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(saved_map.lidar, scans)
     figure, axis = canvas.map_canvas(*canvas.extent(saved_map.poses))
     maps.draw_hits(axis, saved_map.poses, np.asarray(points), np.asarray(scans.hit))

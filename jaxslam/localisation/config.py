@@ -27,12 +27,12 @@ class LocaliseSpec(NamedTuple):
         score_weight: Log likelihood of a score of 1 against one of 0.
         memory: Share of the log likelihood that is kept from one such motion to the next.
         nowhere_score: Score of being at a place that the map does not show.
-        max_log_odds: Log odds of two hypotheses are not told apart beyond this.
+        max_log_odds: Largest difference of two log weights; who has less is given up.
         given_log_odds: Log odds of a pose that is given at the start.
         found_log_odds: Log odds of a pose that the search finds against the best one that is
             tracked, where they explain the last scans equally well.
         lost_score: Score below which the best hypothesis does not explain a scan.
-        lost_scans: Scans after which a robot that is lost and does not move is looked for again.
+        lost_scans: Scans after which a lost robot that does not move is looked for again.
         search_share: Share of the path since the pose was found after which the map is searched
             again,
         search_distance: [m] but no less and no more than these.

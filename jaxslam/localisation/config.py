@@ -30,7 +30,8 @@ class LocaliseSpec(NamedTuple):
         max_log_odds: Largest difference of two log weights; who has less is given up.
         given_log_odds: Log odds of a pose that is given at the start.
         found_log_odds: Log odds of a pose that the search finds against the best one that is
-            tracked, where they explain the last scans equally well.
+            tracked, where they explain the last scans equally well: if that was found just now, and
+            if it has been tracked for 10 m or more, as few robots are carried.
         lost_score: Score below which the best hypothesis does not explain a scan.
         lost_scans: Scans after which a lost robot that does not move is looked for again.
         search_share: Share of the path since the pose was found after which the map is searched
@@ -54,7 +55,7 @@ class LocaliseSpec(NamedTuple):
     nowhere_score: float = 0.6
     max_log_odds: float = 20.0
     given_log_odds: float = 10.0
-    found_log_odds: float = -4.0
+    found_log_odds: tuple[float, float] = (-4.0, -10.0)
     lost_score: float = 0.5
     lost_scans: int = 10
     search_share: float = 0.25

@@ -256,7 +256,7 @@ def _info(spec: LocaliseSpec, place_map: PlaceMap, query: PlaceQuery, found: Fou
     exists = jnp.isfinite(own.log_weight)
     odds = log_odds(spec, own, found.nowhere)
     scan_score = score_pose(spec.place, place_map.places, query, own.poses[0])
-    values = features(odds, own.score[0], scan_score, own.driven[0], widest_std(own.cov[0]))
+    values = features(odds, own.score[0], own.driven[0], widest_std(own.cov[0]))
     return LocaliseInfo(
         own.poses[0],
         own.cov[0],

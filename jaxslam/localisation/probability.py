@@ -9,25 +9,24 @@ from jaxslam.core.types import Array
 RIGHT = (0.25, float(np.radians(5.0)))
 """[m], [rad] from the true pose within which a pose is right."""
 
-COEFFICIENTS = (-10.4, 0.12, 14.2, 0.0, 0.79, -12.0)
+COEFFICIENTS = (-8.6, 0.13, 11.6, 1.4, -31.0)
 """Of the model: constant, then of the features in their order."""
 
 
-def features(log_odds: Array, score: Array, scan_score: Array, driven: Array, std: Array) -> Array:
-    """Features (5,) of a pose.
+def features(log_odds: Array, score: Array, driven: Array, std: Array) -> Array:
+    """Features (4,) of a pose.
 
     Args:
         log_odds: () against all other hypotheses.
         score: () mean score of the last scans.
-        scan_score: () of the last scan.
         driven: () [m] since it was found.
         std: () [m] largest std of its position.
     """
     path = jnp.log1p(jnp.minimum(driven, 10.0))
-    return jnp.stack([log_odds, score, scan_score, path, jnp.minimum(std, 1.0)])
+    return jnp.stack([log_odds, score, path, jnp.minimum(std, 1.0)])
 
 
 def probability(values: Array) -> Array:
-    """Probability () of a pose with these features (5,)."""
+    """Probability () of a pose with these features (4,)."""
     constant, *weights = COEFFICIENTS
     return jax.nn.sigmoid(constant + values @ jnp.array(weights, values.dtype))

@@ -31,6 +31,9 @@ from jaxslam.localisation.hypotheses import (
 from jaxslam.matching.place_fit import PlaceQuery, fit_pose, score_pose
 from jaxslam.matching.place_recognition import KERNEL, find_places, make_query
 
+LONG_TRACKED = 10.0
+"""[m] of a path after which a pose is known for long."""
+
 
 class Found(NamedTuple):
     """What a search changes: the hypotheses, and the log weight () of nowhere."""
@@ -133,7 +136,10 @@ def _search(
     scores = jnp.append(score_of(own.poses), spec.nowhere_score)
     best = jnp.argmax(weights)
     weight = spec.score_weight * jnp.sum(used, dtype=scores.dtype)
-    log_weight = weights[best] + weight * (places.score - scores[best]) + spec.found_log_odds
+    of_new, of_old = spec.found_log_odds
+    tracked_share = jnp.append(jnp.minimum(own.driven / LONG_TRACKED, 1.0), 0.0)[best]
+    log_weight = weights[best] + weight * (places.score - scores[best])
+    log_weight += of_new + tracked_share * (of_old - of_new)
     count = len(places.score)
     candidates = Hypotheses(
         places.poses,

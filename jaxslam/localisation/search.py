@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from jaxslam.core.batching import update_where
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.se2 import relative
+from jaxslam.core.se2 import compose, relative
 from jaxslam.core.types import Array
 from jaxslam.localisation.config import Hypotheses, LocaliseSpec, PlaceMap, Window
 from jaxslam.localisation.hypotheses import (
@@ -54,13 +54,7 @@ def empty_window(spec: LocaliseSpec, lidar: Lidar) -> Window:
 def move_window(window: Window, odometry: Array) -> Window:
     """The window in the frame after an increment (3,)."""
     back = relative(odometry, jnp.zeros_like(odometry))
-    heading = window.poses[:, 2]
-    cos, sin = jnp.cos(back[2]), jnp.sin(back[2])
-    x, y = window.poses[:, 0], window.poses[:, 1]
-    poses = jnp.stack(
-        [back[0] + cos * x - sin * y, back[1] + sin * x + cos * y, heading + back[2]], axis=1
-    )
-    return window._replace(poses=poses)
+    return window._replace(poses=jax.vmap(partial(compose, back))(window.poses))
 
 
 def clear_window(window: Window, cleared: Array) -> Window:

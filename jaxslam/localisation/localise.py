@@ -18,7 +18,7 @@ A batch of robots, or of starts, is one `jax.vmap`:
     steps = jax.jit(jax.vmap(partial(step, spec, lidar), in_axes=(None, 0, 0, 0)))
     states, infos = steps(place_map, states, scans, odometry)
 
-in which a search costs only those robots that need it.
+in which a search costs only those robots that need it. On a CPU it is a loop over the robots.
 
 References:
     Jensfelt, Kristensen (2001), Active global localization for a mobile robot using multiple
@@ -34,6 +34,7 @@ import numpy as np
 from jax import lax
 
 from jaxslam.core import trace_cache
+from jaxslam.core.batching import sequential_vmap_on_cpu
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.types import AnyArray, Array, as_float64
 from jaxslam.localisation.config import (
@@ -165,7 +166,8 @@ def step(
     check_lidar(lidar)
     scan = checks.as_scans("scan", lidar, scan)
     odometry = checks.as_default_float("odometry", odometry, (3,))
-    return _step(spec, lidar, place_map, state, scan, odometry)
+    one = sequential_vmap_on_cpu(partial(_step, spec, lidar))
+    return one(place_map, state, scan, odometry)
 
 
 @partial(trace_cache.jit, static_argnames=("spec", "lidar"))

@@ -8,7 +8,7 @@ import pytest
 from jaxslam.core.batching import pad_to
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import compose, increments, relative
-from jaxslam.localisation import LocaliseSpec, init, map_of_scans, run_steps, step
+from jaxslam.localisation import LocaliseSpec, init, localise, map_of_scans, run_steps, step
 from jaxslam.localisation.probability import RIGHT
 from jaxslam.simulation import path_following, ray_casting, worlds
 
@@ -128,8 +128,9 @@ def robots(drive):
 
 @jax.jit
 def run_all(place_map, scans, odometry):
+    """Infos [T, B], vectorised as on an accelerator; `vmap` of `step` is a loop on a CPU."""
     states = jax.vmap(lambda _: init(SPEC, LIDAR))(odometry[:, 0])
-    steps = jax.vmap(partial(step, SPEC, LIDAR), in_axes=(None, 0, 0, 0))
+    steps = jax.vmap(partial(localise._step, SPEC, LIDAR), in_axes=(None, 0, 0, 0))
 
     def body(states, now):
         return steps(place_map, states, *now)
@@ -158,6 +159,11 @@ def test_robots_are_found_anywhere_and_tracked(drive, together):
 
 def test_a_batch_is_the_same_as_its_robots_one_after_the_other(place_map, robots, together):
     scans, odometry = robots
+    states = jax.vmap(lambda _: init(SPEC, LIDAR))(odometry[:, 0])
+    steps = jax.jit(jax.vmap(partial(step, SPEC, LIDAR), in_axes=(None, 0, 0, 0)))
+    looped = steps(place_map, states, jax.tree.map(lambda x: x[:, 0], scans), odometry[:, 0])[1]
+    for of_all, of_loop in zip(together, looped, strict=True):
+        np.testing.assert_allclose(of_all[0], of_loop, atol=1e-6)
     assert len(np.unique(np.asarray(together.searched).sum(axis=1))) > 1  # some robots, not all
     for k in range(len(odometry)):
         state = init(SPEC, LIDAR)

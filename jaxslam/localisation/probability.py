@@ -10,7 +10,7 @@ RIGHT = (0.25, float(np.radians(5.0)))
 """[m], [rad] from the true pose within which a pose is right."""
 
 COEFFICIENTS = (-8.6, 0.13, 11.6, 1.4, -31.0)
-"""Of the model: constant, then of the features in their order. Of most likelihood on ACES, Intel and
+"""Of the model: constant, then of the features in their order. Of most likelihood on ACES, Intel,
 Freiburg 101: each log in its own map, and in that of its first half, also where that shows nothing.
 """
 

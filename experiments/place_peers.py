@@ -27,8 +27,8 @@ from jax import lax
 from jaxslam.core.features import Features
 from jaxslam.core.se2 import rotation, wrap_angle
 from jaxslam.core.types import WALL, Array
+from jaxslam.matching.place_fit import PlaceQuery
 from jaxslam.matching.place_index import PlaceIndex, PlaceSpec
-from jaxslam.matching.place_recognition import PlaceQuery
 
 NUM_HEADINGS = 120
 SEARCH_STD = 0.15  # [m] of a point's distance from a wall, about that of poses from the grid

@@ -36,8 +36,9 @@ from jaxslam.core.time_series import match_times
 from jaxslam.core.types import AnyArray
 from jaxslam.evaluation.trajectory import align_trajectory
 from jaxslam.io.errors import InputError
+from jaxslam.matching.place_fit import PlaceQuery
 from jaxslam.matching.place_index import PlaceSpec, build_index
-from jaxslam.matching.place_recognition import PlaceQuery, find_places, make_query
+from jaxslam.matching.place_recognition import find_places, make_query
 from jaxslam.pipeline import log_input
 
 NAME = "place_recognition"

@@ -13,8 +13,8 @@ import jaxslam
 
 HOME = Path(next(iter(jaxslam.__path__)))
 PACKAGES = (
-    "core frontend matching filtering smoothing mapping pipeline evaluation simulation tuning "
-    "io viz cli"
+    "core frontend matching filtering smoothing mapping localisation pipeline evaluation "
+    "simulation tuning io viz cli"
 ).split()
 FILES = sorted(HOME.rglob("*.py"))
 MAX_LINES = 350

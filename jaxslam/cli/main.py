@@ -1,4 +1,4 @@
-"""The command line: `jaxslam simulate`, `run LOG`, `map MAP.yaml` and `tune [LOG ...]`."""
+"""The command line: `jaxslam simulate`, `run`, `localise`, `map` and `tune`."""
 
 import inspect
 import re
@@ -10,6 +10,7 @@ import tyro
 
 import jaxslam
 from jaxslam.cli import deprecated
+from jaxslam.cli.localise_command import localise_in_map
 from jaxslam.cli.map_command import map_occupancy
 from jaxslam.cli.run_command import run
 from jaxslam.cli.simulate_command import simulate
@@ -22,6 +23,7 @@ ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 COMMANDS: dict[str, Callable[..., Any]] = {
     "simulate": simulate,
     "run": run,
+    "localise": localise_in_map,
     "map": map_occupancy,
     "tune": tune,
 }

@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
@@ -14,11 +15,12 @@ from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map
+from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, tum
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
 from jaxslam.io.geojson import KINDS, Arc, Node
-from jaxslam.io.output import write_json
+from jaxslam.io.output import write_json, write_text
+from jaxslam.localisation.config import LocaliseInfo
 from jaxslam.mapping import pose_graph
 from jaxslam.mapping.occupancy import occupancy_map
 from jaxslam.mapping.saved_map import SavedMap
@@ -190,6 +192,39 @@ def draw(
     figure, axes = canvas.canvas(9.0, 6.0, 3)
     charts.draw_errors(axes[:, 0], np.asarray(result.info.pose_cov), error, result.keyframes)
     figure.savefig(out_dir / "errors.png")
+
+
+def write_localisation(
+    out_dir: Path, numbers: Metrics, times: np.ndarray, infos: LocaliseInfo, likely: float
+) -> None:
+    """Write metrics.json, quality.csv, and of poses that are `likely` trajectory.tum.
+
+    Args:
+        out_dir: Folder to write to.
+        numbers: Of metrics.json.
+        times: (T,) [s] of the scans.
+        infos: [T], NumPy.
+        likely: Least probability of a pose of trajectory.tum.
+    """
+    write_json(out_dir / "metrics.json", numbers)
+    poses = np.asarray(infos.pose, np.float64)
+    chosen = infos.probability >= likely
+    tum.write(out_dir / "trajectory.tum", times[chosen], poses[chosen])
+    rows = zip(times, *poses.T, infos.probability, strict=True)
+    lines = [f"{t:.6f},{x:.4f},{y:.4f},{yaw:.5f},{p:.4f}" for t, x, y, yaw, p in rows]
+    write_text(out_dir / "quality.csv", "\n".join(["t,x,y,yaw,probability", *lines, ""]))
+
+
+def draw_localisation(path: Path, saved_map: SavedMap, infos: LocaliseInfo) -> None:
+    """Draw the poses of a log, by their probability, over the walls of a map."""
+    from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
+
+    scans = saved_map.scans._replace(ranges=jnp.asarray(saved_map.scans.ranges, float))
+    points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(saved_map.lidar, scans)
+    figure, axis = canvas.map_canvas(*canvas.extent(saved_map.poses))
+    maps.draw_hits(axis, saved_map.poses, np.asarray(points), np.asarray(scans.hit))
+    maps.draw_probable_poses(axis, infos.pose, infos.probability)
+    figure.savefig(path)
 
 
 def draw_map(path: Path, occupancy: OccupancyMap, graph: TopologicalMap) -> None:

@@ -53,6 +53,20 @@ def print_summary(numbers: Metrics, title: str, out: Path) -> None:
     print(f"results: {out}{os.sep}metrics.json, path.png, errors.png, map.geojson, ...")
 
 
+def print_localisation(numbers: Metrics, title: str, out: Path) -> None:
+    """Print a summary of the `metrics.json` of a localisation."""
+    print(f"\n{title}; path length {numbers['path_length_m']:.0f} m")
+    for note in numbers["mended"]:
+        print(f"note: {note}")
+    _print_errors(numbers, {})
+    after = numbers["found_after_m"]
+    print(f"  {'found after [m]':34}{'never' if after is None else f'{after:.1f}':>10}")
+    print(f"  {'scans with probability above 0.9':34}{numbers['sure']:10.1%}")
+    print(f"  {'searches of the map':34}{numbers['searches']:10d}")
+    _print_seconds(numbers)
+    print(f"results: {out}{os.sep}metrics.json, quality.csv, trajectory.tum, localised.png")
+
+
 def _print_consistency(consistency: Metrics) -> None:
     """Print the share of scans that the map explains, and how far walls of two visits are apart."""
     walls = consistency["walls_median_m"]

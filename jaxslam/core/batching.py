@@ -52,6 +52,61 @@ def sequential_vmap_on_cpu(function: Callable) -> Callable:
     return sequential
 
 
+def update_where(wanted: Array, update: Callable, state: Any, *given: Any, block: int) -> Any:
+    """`update(state, *given)` where `wanted`, else `state`; under vmap only for those that want it.
+
+    `vmap` turns a `lax.cond` with a batched condition into a select that computes all of a batch.
+    This function has its own batching rule: members that want it are gathered and updated, a block
+    of them at a time, so the cost is that of their number, rounded up to whole blocks.
+
+    Args:
+        wanted: () bool.
+        update: Of records of arrays; it must not close over arrays: pass them in `given`.
+        state: What is updated; the result has its structure, shapes and dtypes.
+        *given: Further arguments of `update`.
+        block: Members of a batch that are updated at once.
+
+    Returns:
+        The state. It has no derivative rule.
+    """
+
+    @custom_vmap
+    def branch(wanted: Array, operands: Any) -> Any:
+        return lax.cond(wanted, lambda xs: update(xs[0], *xs[1]), lambda xs: xs[0], operands)
+
+    @branch.def_vmap
+    def in_blocks(size: int, is_batched: Any, wanted: Array, operands: Any) -> tuple[Any, Any]:
+        state, given = operands
+        own_wanted, (own_state, own_given) = is_batched
+        wanted = wanted if own_wanted else jnp.broadcast_to(wanted, (size,))
+        state = jax.tree.map(
+            lambda x, own: x if own else jnp.broadcast_to(x, (size, *x.shape)),
+            state,
+            own_state,
+        )
+        order = jnp.argsort(~wanted)  # stable: those that want it, in their order, come first
+        order = jnp.concatenate([order, jnp.full(block, size, order.dtype)])
+        count = jnp.sum(wanted, dtype=jnp.int32)
+        leaves, treedef = jax.tree.flatten(given)
+        batched = jax.tree.leaves(own_given)
+
+        def on_block(number: Array, state: Any) -> Any:
+            rank = number * block + jnp.arange(block, dtype=jnp.int32)
+            chosen = jnp.where(rank < count, order[rank], size)  # `size`: none
+            some = [x[chosen] if own else x for x, own in zip(leaves, batched, strict=True)]
+            axes = jax.tree.unflatten(treedef, [0 if own else None for own in batched])
+            of_block = jax.tree.map(lambda x: x[chosen], state)
+            after = jax.vmap(lambda state, given: update(state, *given), (0, axes))(
+                of_block, jax.tree.unflatten(treedef, some)
+            )
+            return jax.tree.map(lambda x, y: x.at[chosen].set(y, mode="drop"), state, after)
+
+        result = lax.fori_loop(0, (count + block - 1) // block, on_block, state)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return branch(wanted, (state, given))
+
+
 def map_batches(function: Callable, items: Any, *, batch_size: int) -> Any:
     """Map `function` over the leading axis of `items`, `batch_size` of them vectorised at a time.
 

@@ -10,10 +10,10 @@ from jaxslam.matching.loop_closure import find_loop_closures as find_loop_closur
 from jaxslam.matching.map_places import JoinSpec as JoinSpec
 from jaxslam.matching.map_places import ScanMap as ScanMap
 from jaxslam.matching.odometry_fusion import fuse_odometry as fuse_odometry
+from jaxslam.matching.place_fit import PlaceQuery as PlaceQuery
 from jaxslam.matching.place_index import PlaceIndex as PlaceIndex
 from jaxslam.matching.place_index import PlaceSpec as PlaceSpec
 from jaxslam.matching.place_index import build_index as build_index
-from jaxslam.matching.place_recognition import PlaceQuery as PlaceQuery
 from jaxslam.matching.place_recognition import Places as Places
 from jaxslam.matching.place_recognition import find_places as find_places
 from jaxslam.matching.place_recognition import make_query as make_query

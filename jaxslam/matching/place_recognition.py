@@ -7,13 +7,8 @@ A query is one scan, or several joined by odometry where one shows too little. H
 positions of the index, each with four headings, one a quadrant: those at which the query agrees
 best with what a scanner would measure there (`place_views`). Those that agree best are scored by
 some points of the query, by their distances d from the walls of the map; the best are refined by
-point-to-line ICP, where a cell names the wall of a point, scored again, and refined with all
-points. The final score is the share of the points that lie on walls, less that of what the query
-saw to be free and which is a wall in the map. Points are on walls by d, which is of cells, and by
-their distance e across the wall, which is exact:
-
-    score = mean (w(d) + w(e)) / 2 over points - mean w(d) over points of free space
-    w(d) = exp(-d^2 / (2 std^2))
+point-to-line ICP, scored again, refined with all points, and scored by them (`place_fit` has the
+formulas).
 
 Look-alike places have about the same score. So the difference between the best and the best at any
 other place, the margin, decides with the score whether a place is accepted; the others are returned
@@ -33,12 +28,12 @@ from jax import lax
 
 from jaxslam.core import trace_cache
 from jaxslam.core.scan import Lidar, Scan, check_lidar
-from jaxslam.core.se2 import dot, rotation, transform, wrap_angle
+from jaxslam.core.se2 import transform, wrap_angle
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
-from jaxslam.matching.icp import solve
 from jaxslam.matching.oriented_points import oriented_points, towards_scanner, transform_points
+from jaxslam.matching.place_fit import PlaceQuery, distance_at, fit_pose, mean_of, score_pose
 from jaxslam.matching.place_index import PlaceIndex, PlaceSpec, check_place_spec
 from jaxslam.matching.place_views import NUM_BEARINGS, agreement, view_of_points
 
@@ -48,32 +43,12 @@ FREE_BEFORE = (0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
 MAX_FREE_SHARE = 0.95
 """Share of a range up to which that is: not the scanner itself."""
 
-PRIOR_STD = (0.5, 0.1)
-"""[m], [rad] std of a hypothesis, which keeps what a corridor does not constrain."""
+PRIOR_STD = (0.5, 0.5, 0.1)
+"""[m], [m], [rad] std of a hypothesis, which keeps what a corridor does not constrain."""
 
 
-ON_LINE = 2.5
-"""Cells from the nearest surface up to which a point is on its line."""
-
-
-class PlaceQuery(NamedTuple):
-    """What is looked for, in the frame of the last scan: P points.
-
-    Attributes:
-        points: (P, 2) [m] where beams ended.
-        normal: (P, 2) unit normals of their surfaces, to where they were seen from; 0 if unknown.
-        valid: (P,) bool.
-        free: (P, F, 2) [m] in free space before each point.
-        is_free: (P, F) bool, those of them that exist.
-        view: (2, K, F) spectrum of the ranges around the last scan, see `place_views`.
-    """
-
-    points: Array
-    normal: Array
-    valid: Array
-    free: Array
-    is_free: Array
-    view: Array
+KERNEL = 0.3
+"""Std of a point's distance from its wall in a refinement, as a fraction of its gate."""
 
 
 class Places(NamedTuple):
@@ -163,7 +138,7 @@ def find_places(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery) -> Places
     poses = jax.vmap(partial(_refine, spec, index, some, spec.coarse_gates))(poses)
     poses, exists = best_of(spec.coarse_std / 2, spec.num_fine, poses, exists)
     poses = jax.vmap(partial(_refine, spec, index, query, spec.fine_gates))(poses)
-    scores = jax.vmap(partial(_score, spec, index, query))(poses)
+    scores = jax.vmap(partial(score_pose, spec, index, query))(poses)
     poses, scores = _distinct(spec, poses, jnp.where(exists, scores, -jnp.inf))
     margin = scores[0] - scores[1] if len(scores) > 1 else scores[0]
     certainty = scores[0] + spec.margin_weight * jnp.minimum(margin, spec.max_margin)
@@ -185,55 +160,18 @@ def _hypotheses(index: PlaceIndex, query: PlaceQuery, size: int) -> tuple[Array,
 def _refine(
     spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, gates: tuple[float, ...], start: Array
 ) -> Array:
-    """Pose (3,) by point-to-line ICP from a hypothesis."""
-    std = jnp.array([PRIOR_STD[0], PRIOR_STD[0], PRIOR_STD[1]])
-    prior = jnp.diag(1.0 / std**2)
-
-    def step(pose: Array, gate: Array) -> tuple[Array, None]:
-        points = transform(pose, query.points)
-        distance = _look_up(spec, index, points, index.distance)
-        normal = _look_up(spec, index, points, index.normal)
-        offset = _look_up(spec, index, points, index.offset)
-        error = dot(normal, points - index.origin[None]) - offset
-        facing = dot(normal, query.normal @ rotation(pose[2]).T) > 0.5
-        used = query.valid & facing & (distance < gate)
-        weight = jnp.where(used, 1.0 / (1.0 + (error / gate) ** 2) ** 2, 0.0)
-        arm = points - pose[None, :2]
-        by_heading = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
-        columns = jnp.stack([*normal.T, by_heading, error])
-        square = (columns[:3] * weight[None]) @ columns.T / (0.3 * gate) ** 2
-        descent = prior @ (start - pose) - square[:, 3]
-        return pose + solve(square[:, :3] + prior, descent), None
-
-    return lax.scan(step, start, jnp.array(gates))[0]
+    """Pose (3,) from a hypothesis (3,)."""
+    stds = tuple(KERNEL * gate for gate in gates)
+    prior = jnp.diag(1.0 / jnp.array(PRIOR_STD) ** 2)
+    return fit_pose(spec, index, query, gates, stds, start, prior).pose
 
 
 def _coarse_score(
     spec: PlaceSpec, std: float, index: PlaceIndex, query: PlaceQuery, pose: Array
 ) -> Array:
     """Share () of the points near walls, by a std [m] of their distances."""
-    distance = _look_up(spec, index, transform(pose, query.points), index.distance)
-    return _mean(1.0 / (1.0 + (distance / std) ** 2) ** 2, query.valid)
-
-
-def _score(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, pose: Array) -> Array:
-    """Share of the points on walls, less that of free space that is a wall; ()."""
-
-    def on_wall(distance: Array) -> Array:
-        return jnp.exp(-0.5 * (distance / spec.std) ** 2)
-
-    points = transform(pose, query.points)
-    distance = _look_up(spec, index, points, index.distance)
-    normal = _look_up(spec, index, points, index.normal)
-    across = dot(normal, points - index.origin[None]) - _look_up(spec, index, points, index.offset)
-    on_line = jnp.where(distance < ON_LINE * spec.cell, on_wall(across), 0.0)
-    free = transform(pose, query.free.reshape(-1, 2))
-    in_wall = on_wall(_look_up(spec, index, free, index.distance))
-    return (
-        0.5 * _mean(on_wall(distance), query.valid)
-        + 0.5 * _mean(on_line, query.valid)
-        - _mean(in_wall, query.is_free.ravel())
-    )
+    distance = distance_at(spec, index, transform(pose, query.points))
+    return mean_of(1.0 / (1.0 + (distance / std) ** 2) ** 2, query.valid)
 
 
 def _distinct(spec: PlaceSpec, poses: Array, scores: Array) -> tuple[Array, Array]:
@@ -250,22 +188,9 @@ def _distinct(spec: PlaceSpec, poses: Array, scores: Array) -> tuple[Array, Arra
     return lax.scan(take, scores, length=spec.num_candidates)[1]
 
 
-def _look_up(spec: PlaceSpec, index: PlaceIndex, points: Array, table: Array) -> Array:
-    """Entries of a table (G, H, ...) at points (N, 2) [m] of the map frame."""
-    cell = jnp.round((points - index.origin[None]) / spec.cell).astype(jnp.int32)
-    height, width = table.shape[:2]
-    return table[cell[:, 0].clip(0, height - 1), cell[:, 1].clip(0, width - 1)]
-
-
 def _evenly(valid: Array, count: int) -> Array:
     """Indices (count,) of those that are valid (N,), evenly spaced among them."""
     total = jnp.sum(valid, dtype=jnp.int32)
     rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
     wanted = jnp.arange(count, dtype=jnp.int32) * jnp.maximum(total, count) // count
     return jnp.searchsorted(rank, wanted).clip(0, len(valid) - 1)
-
-
-def _mean(values: Array, valid: Array) -> Array:
-    """Mean () of the values (N,) that are valid; 0 of none."""
-    total = jnp.sum(jnp.where(valid, values, 0.0))
-    return total / jnp.maximum(jnp.sum(valid, dtype=values.dtype), 1.0)

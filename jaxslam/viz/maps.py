@@ -102,6 +102,26 @@ def draw_wrong_parts(axis: Axes, poses: AnyArray, parts: Sequence[tuple[int, int
         axis.plot(x, y, "o-", color=RED, markersize=8, linewidth=6, zorder=3.5, label=label)
 
 
+def draw_probable_poses(axis: Axes, poses: AnyArray, probability: AnyArray) -> None:
+    """Draw positions coloured by the probability that they are right, with a bar of the colours.
+
+    Args:
+        axis: Axis to draw on.
+        poses: (T, 3) [m, m, rad], map frame.
+        probability: (T,).
+
+    Raises:
+        ValueError: An argument has another shape.
+    """
+    x, y = as_float64("poses", poses, ("T", 3))[:, :2].T
+    chance = as_float64("probability", probability, x.shape)
+    order = np.argsort(chance, kind="stable")
+    dots = axis.scatter(
+        x[order], y[order], s=9, c=chance[order], cmap="cividis_r", vmin=0.0, vmax=1.0, zorder=2.0
+    )
+    axis.figure.colorbar(dots, ax=axis, shrink=0.6, label="probability")
+
+
 def draw_robot(axis: Axes, pose: AnyArray, ends: AnyArray) -> None:
     """Draw the robot and its scan.
 

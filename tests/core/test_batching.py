@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core.batching import map_batches, pad_to, sequential_vmap_on_cpu
+from jaxslam.core.batching import map_batches, pad_to, sequential_vmap_on_cpu, update_where
 
 
 def assert_same(one, two):
@@ -82,3 +82,41 @@ def test_items_may_be_arrays_of_numpy_or_jax(kind):
 def test_items_that_cannot_be_mapped_are_refused(items, size, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         map_batches(function, items, batch_size=size)
+
+
+@pytest.mark.parametrize("block", [1, 3, 8])
+def test_updates_where_wanted_are_those_of_the_loop(block):
+    wanted = jnp.array([True, False, True, True, False, True, True])
+    state = {"a": jnp.arange(7.0), "b": jnp.arange(14.0).reshape(7, 2)}
+    own, shared = jnp.arange(7.0) + 10.0, jnp.array([2.0, 3.0])
+
+    def update(state, own, shared):
+        return {"a": state["a"] + own, "b": state["b"] * shared}
+
+    def one(wanted, state, own):
+        return update_where(wanted, update, state, own, shared, block=block)
+
+    found = jax.jit(jax.vmap(one))(wanted, state, own)
+    for k in range(7):
+        item = jax.tree.map(lambda x: x[k], state)  # noqa: B023
+        expected = update(item, own[k], shared) if wanted[k] else item
+        jax.tree.map(np.testing.assert_array_equal, expected, one(wanted[k], item, own[k]))
+        of_batch = jax.tree.map(lambda x: x[k], found)  # noqa: B023
+        jax.tree.map(np.testing.assert_array_equal, expected, of_batch)
+
+
+def test_updates_that_are_not_wanted_are_not_computed():
+    calls = []
+
+    def update(state):
+        jax.debug.callback(lambda _: calls.append(1), state)
+        return state + 1.0
+
+    def one(wanted, state):
+        return update_where(wanted, update, state, block=2)
+
+    for count, expected in ((0, 0), (1, 2), (4, 4), (5, 6)):
+        calls.clear()
+        jax.block_until_ready(jax.vmap(one)(jnp.arange(9) < count, jnp.arange(9.0)))
+        jax.effects_barrier()
+        assert len(calls) == expected

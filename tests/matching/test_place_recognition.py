@@ -9,7 +9,7 @@ from simulated_scans import LIDAR, item, scans_of
 
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2_np import compose, relative
-from jaxslam.matching import oriented_points, place_index, place_recognition
+from jaxslam.matching import oriented_points, place_fit, place_index
 from jaxslam.matching.place_index import PlaceSpec, build_index
 from jaxslam.matching.place_recognition import find_places, make_query
 from jaxslam.simulation import path_following, ray_casting, worlds
@@ -168,7 +168,7 @@ def test_cells_know_the_nearest_surface(office, index):
 def test_the_score_is_that_of_the_slow_version(index, queries):
     query = make_query(SPEC, LIDAR, item(queries[1], slice(4, 5)), HERE)
     pose = np.array([*queries[0][4, :2] + 0.07, queries[0][4, 2]])
-    fast = place_recognition._score(SPEC, index, query, jnp.asarray(pose))
+    fast = place_fit.score_pose(SPEC, index, query, jnp.asarray(pose))
 
     def on_wall(point, across=False):
         xy = compose(pose, np.array([*point, 0.0]))[:2] - np.asarray(index.origin)

@@ -49,6 +49,17 @@ def test_wrong_parts_of_a_trajectory_are_marked_in_red(axis):
     assert [line.get_label() for line in axis.lines] == ["map contradicts itself", "_wrong"]
 
 
+def test_poses_are_coloured_by_their_probability_the_likely_ones_on_top(axis):
+    poses, probability = np.arange(9.0).reshape(3, 3), np.array([0.9, 0.1, 0.5])
+    maps.draw_probable_poses(axis, poses, probability)
+    (dots,) = axis.collections
+    np.testing.assert_array_equal(dots.get_offsets(), poses[[1, 2, 0], :2])
+    np.testing.assert_array_equal(dots.get_array(), [0.1, 0.5, 0.9])
+    assert dots.get_clim() == (0.0, 1.0)
+    with pytest.raises(ValueError, match="probability"):
+        maps.draw_probable_poses(axis, poses, probability[:2])
+
+
 def test_confirmed_landmarks_are_drawn_with_three_sigma_ellipses(axis):
     maps.draw_landmarks(axis, belief(), confirm_count=2)
     positions = [line.get_xydata().tolist() for line in axis.lines]

@@ -34,10 +34,26 @@ from jaxslam.tuning.parameters import param_names
 MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
 
 
-def write_results(out_dir: Path, numbers: Metrics, topological_map: TopologicalMap) -> None:
-    """Write metrics.json and map.geojson to the folder `out_dir`."""
+def write_results(
+    out_dir: Path,
+    numbers: Metrics,
+    topological_map: TopologicalMap,
+    old: AnnotatedMap | None = None,
+    next_id: int = 0,
+) -> None:
+    """Write metrics.json and map.geojson to a folder.
+
+    Args:
+        out_dir: Folder to write to.
+        numbers: Of metrics.json; notes on what of `old` was not kept are added to `mended`.
+        topological_map: The map.
+        old: As of `write_map`.
+        next_id: As of `write_map`.
+    """
+    notes = write_map(out_dir / "map.geojson", topological_map, old, next_id)
+    if notes:
+        numbers["mended"] = [*numbers.get("mended", ()), *notes]
     write_json(out_dir / "metrics.json", numbers)
-    write_map(out_dir / "map.geojson", topological_map)
 
 
 def write_maps(
@@ -97,7 +113,7 @@ def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
 
 
 def write_map(
-    path: Path, graph: TopologicalMap, old: AnnotatedMap | None = None
+    path: Path, graph: TopologicalMap, old: AnnotatedMap | None = None, next_id: int = 0
 ) -> tuple[str, ...]:
     """Write a topological map as GeoJSON.
 
@@ -106,6 +122,7 @@ def write_map(
         graph: The map.
         old: Map of the sessions before, as `annotated_map.read` gives it: ids of arcs and what a
             user added are carried over.
+        next_id: Id of the next landmark; edges have ids from there on.
 
     Returns:
         Notes on what of `old` could not be kept as it was.
@@ -127,9 +144,9 @@ def write_map(
         for index, (start, end) in enumerate(graph.arc_ends)
     ]
     if old is None:
-        geojson.write(path, nodes, arcs)
+        geojson.write(path, nodes, arcs, next_id=next_id)
         return ()
-    kept = carry_over(old, nodes, arcs)
+    kept = carry_over(old._replace(next_id=max(old.next_id, next_id)), nodes, arcs)
     geojson.write(path, kept.nodes, kept.arcs, features=kept.features, members=kept.members)
     return kept.notes
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -32,8 +32,9 @@ from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.io import annotated_map, tum
 from jaxslam.io import relations as relations_file
-from jaxslam.io import tum
+from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.errors import InputError
 from jaxslam.io.map_file import load_map
 from jaxslam.io.output import folder
@@ -95,7 +96,8 @@ def run(
             the online estimates.
         noise: File of the noise parameters of the filter (Q and R); by default cautious ones.
         saved_map: Output folder of an earlier run, of the same scanner, whose map is continued:
-            where its places are found again, landmarks keep their ids, and new ones are added.
+            where its places are found again, landmarks keep their ids, new ones are added, and
+            what a user added to its map.geojson stays.
         scan_topic: Topic of the laser scans in a bag; by default the one with most messages.
         odometry_topic: Topic of the odometry or of the transforms in a bag; by default the one
             with most messages.
@@ -114,7 +116,7 @@ def run(
     references, reference_notes = _references(log, reference)
     verified = _of_each("--relations", log, relations)
     match_scans = odometry != "wheels"
-    earlier = None if saved_map is None else load_map(saved_map)
+    earlier, annotated = (None, None) if saved_map is None else _read_map(saved_map)
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     inputs, drives = [], []
     for path, laser_log, known, file in zip(log, logs, references, verified, strict=True):
@@ -163,6 +165,7 @@ def run(
             of_base=pose_frame == "base",
             gif=gif,
             saved_map=earlier,
+            annotated_map=annotated,
         )
         folders = [f"part_{k + 2}" for k in range(len(result.other_parts))]
         extra: Metrics = {
@@ -184,6 +187,19 @@ def run(
     size = f"{numbers['scans']} scans, {numbers['keyframes']} keyframes"
     summaries.print_summary(numbers, f"{size} of {title}", out)
     return INCONSISTENT if strict and num_warnings else 0
+
+
+def _read_map(folder_of_map: Path) -> tuple[SavedMap, AnnotatedMap | None]:
+    """The map in a folder, and what a user added to its map.geojson."""
+    if not folder_of_map.is_dir():
+        advice = "name an output folder of `jaxslam run`"
+        raise InputError("is no folder", path=folder_of_map, advice=advice)
+    saved = load_map(folder_of_map)
+    annotated = annotated_map.read(folder_of_map / "map.geojson")
+    if annotated is not None:  # no new landmark takes an id that was used for anything else
+        next_id: Any = np.int32(max(int(saved.belief.next_id), annotated.next_id))
+        saved = saved._replace(belief=saved.belief._replace(next_id=next_id))
+    return saved, annotated
 
 
 class _Reference(NamedTuple):

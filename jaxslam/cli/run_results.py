@@ -17,6 +17,7 @@ from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import tum
+from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.log_input import LogInput
 from jaxslam.pipeline.results import SlamResult
@@ -53,6 +54,7 @@ class RunContext(NamedTuple):
         of_base: Whether trajectory.tum holds poses of the robot, not of the scanner.
         gif: Whether an animation is written.
         saved_map: The map that the run goes on in, if any.
+        annotated_map: Its map.geojson, with what a user added.
     """
 
     drives: tuple[RecordedDrive, ...]
@@ -62,6 +64,7 @@ class RunContext(NamedTuple):
     of_base: bool
     gif: bool
     saved_map: SavedMap | None = None
+    annotated_map: AnnotatedMap | None = None
 
 
 def without_errors(drive: RecordedDrive) -> RecordedDrive:
@@ -146,7 +149,11 @@ def write(
                 log_errors.reference_in_map(here.log.times, here.result.poses, drive.reference)
             )
     numbers["path_length_m"] = path_length
-    report.write_results(out_dir, numbers, result.topological_map)
+    saved, old = context.saved_map, context.annotated_map
+    if result.saved_poses is None:  # a map of its own
+        saved, old = None, None
+    next_id = int(result.belief.next_id)
+    report.write_results(out_dir, numbers, result.topological_map, old, next_id)
     measurements = Measurement(
         jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
     )
@@ -155,7 +162,6 @@ def write(
     )
     of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
     times = np.concatenate([drive.log.times for drive in context.drives])[result.keyframes]
-    saved = None if result.saved_poses is None else context.saved_map
     report.write_maps(
         out_dir, config, context.params, result, measurements, times, of_keyframes, saved
     )

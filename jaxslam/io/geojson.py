@@ -73,16 +73,18 @@ def write(
     arcs: Sequence[Arc],
     frame: str = "map",
     *,
+    next_id: int = 0,
     features: Sequence[Mapping[str, Any]] = (),
     members: Mapping[str, Any] = NOTHING,
 ) -> None:
-    """Write a map; edge ids follow the highest node id, as nav2_route has one set of ids.
+    """Write a map; edge ids follow those of all nodes, as nav2_route has one set of ids.
 
     Args:
         path: File to write, atomically.
         nodes: Their ids are distinct.
         arcs: Arcs between them.
         frame: Name of the frame of the coordinates.
+        next_id: No landmark has had this id or a higher one, also those that are no nodes yet.
         features: More features, of the user.
         members: More members of the file, of the user; `name` replaces ours.
 
@@ -92,7 +94,7 @@ def write(
         InputError: The file cannot be written.
     """
     _check(nodes, arcs)
-    first_edge = 1 + max((int(node.id) for node in nodes), default=-1)
+    first_edge = max(next_id, 1 + max((int(node.id) for node in nodes), default=-1))
     written = [_node_feature(node, frame) for node in nodes]
     for arc in arcs:
         points = np.asarray(arc.points, np.float64)

@@ -2,7 +2,8 @@
 
 A robot that was carried, or whose log lacks scans, is found out by its first scan after that.
 After a pause of the scanner, this contradicts the wheels, or explains little. Without a pause,
-hardly any of it is explained, though a wide window was searched. What comes after a break is a
+hardly any of it is explained, though a wide window was searched, or little, and the wheels were
+contradicted as well. What comes after a break is a
 piece of its own, with a trajectory and walls in its own frame; `pieces` joins them.
 """
 
@@ -19,6 +20,9 @@ PAUSE_INLIERS = 0.3
 
 BREAK_INLIERS = 0.2
 """The same for any scan."""
+
+BOTH_FAIL = (0.4, 0.8)
+"""Inlier fraction, and weight of the wheels, below both of which neither of them says anything."""
 
 MAX_UNKNOWN_MOTION = (0.3, 0.3)
 """[m], [rad] of motion during a pause, where no wheels say that there was any."""
@@ -54,12 +58,14 @@ def first_break(
         use_odometry: Whether the matches are expected where the wheels have them.
     """
     inliers, moved = np.asarray(matches.inlier_fraction), np.abs(np.asarray(matches.increment))
+    broken = inliers < BREAK_INLIERS
     if use_odometry:
-        contradicts = np.asarray(matches.odometry_weight) < 0.5
+        weight = np.asarray(matches.odometry_weight)
+        broken |= (inliers < BOTH_FAIL[0]) & (weight < BOTH_FAIL[1])
+        contradicts = weight < 0.5
     else:
         contradicts = np.hypot(moved[:, 0], moved[:, 1]) > MAX_UNKNOWN_MOTION[0]
         contradicts |= moved[:, 2] > MAX_UNKNOWN_MOTION[1]
-    broken = after_pause & (contradicts | (inliers < PAUSE_INLIERS))
-    broken |= inliers < BREAK_INLIERS
+    broken |= after_pause & (contradicts | (inliers < PAUSE_INLIERS))
     found = np.flatnonzero(broken & (num_returns >= MIN_RETURNS))
     return int(found[0]) if found.size else None

@@ -45,6 +45,8 @@ def test_a_pause_is_an_interval_much_longer_than_usual_and_of_some_seconds():
         ({"odometry_weight": (3, 0.1)}, None),
         ({"inlier_fraction": (3, 0.25)}, None),
         ({"inlier_fraction": (3, 0.1)}, 3),
+        ({"inlier_fraction": (3, 0.35), "odometry_weight": (3, 0.7)}, 3),
+        ({"inlier_fraction": (3, 0.35), "odometry_weight": (2, 0.7)}, None),
     ],
 )
 def test_the_first_scan_after_a_pause_breaks_the_drive_where_it_does_not_fit(changed, found):

@@ -82,7 +82,8 @@ def own_rows(log: Log) -> Numbers:
             bar.update(int(np.asarray(part.keyframes)[-1]) + 1 - bar.n)
 
         result = log_input.run(given, callback=show)
-    found = check_map(given.config.frontend.lidar, result.poses, given.scans)
+    lidar = given.config.frontend.lidar
+    found = check_map(lidar, result.poses, given.scans, piece=result.piece)
     estimates = {OWN: result.poses, DEAD_RECKONING: given.odom_poses}
     rows = []
     for method, poses in estimates.items():

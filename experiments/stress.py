@@ -102,22 +102,27 @@ def run_log(log: LaserLog, source: OdometrySource) -> tuple[np.ndarray, bool, li
     """Run a log as `jaxslam run` does.
 
     Returns:
-        Smoothed poses (T, 3); whether the map contradicts itself; and the notes on the log.
+        Smoothed poses (T, 3), NaN for scans that are not in the largest map; whether the map
+        contradicts itself, or there are several; and the notes on the log.
     """
     given = log_input.from_laser_log(log, source)
     result = log_input.run(given)
-    found = check_map(given.config.frontend.lidar, result.poses, given.scans)
-    return result.poses, len(found.warnings) > 0, [*given.notes, *result.notes]
+    lidar = given.config.frontend.lidar
+    found = check_map(lidar, result.poses, given.scans, piece=result.piece)
+    warned = len(found.warnings) > 0 or len(result.other_parts) > 0
+    return result.poses, warned, [*given.notes, *result.notes]
 
 
 def errors(source: Source, numbers: np.ndarray, poses: np.ndarray) -> Numbers:
     """Errors of poses (K, 3) of the scans of these numbers (K,); None where there is no reference.
 
-    Relations are taken between scans at their times where the log has these, else at the times
+    Poses that are not finite are left out. Relations are taken between scans at their times where the log has these, else at the times
     extended by the undamaged odometry.
     """
     found: Numbers = dict.fromkeys(("ate_rmse_m", "relations_translation_m"))
     found["relations_rotation_deg"] = None
+    mapped = np.isfinite(poses).all(axis=1)
+    numbers, poses = numbers[mapped], poses[mapped]
     known = np.isfinite(source.truth[numbers]).all(axis=1)
     if known.sum() > 1:
         truth = source.truth[numbers][known]

@@ -116,8 +116,8 @@ def run_log(log: LaserLog, source: OdometrySource) -> tuple[np.ndarray, bool, li
 def errors(source: Source, numbers: np.ndarray, poses: np.ndarray) -> Numbers:
     """Errors of poses (K, 3) of the scans of these numbers (K,); None where there is no reference.
 
-    Poses that are not finite are left out. Relations are taken between scans at their times where the log has these, else at the times
-    extended by the undamaged odometry.
+    Poses that are not finite are left out. Relations are taken between scans at their times where
+    the log has these, else at the times extended by the undamaged odometry.
     """
     found: Numbers = dict.fromkeys(("ate_rmse_m", "relations_translation_m"))
     found["relations_rotation_deg"] = None

@@ -91,11 +91,12 @@ def by_odometry(monkeypatch):
     """SLAM that returns odometry, without its turns."""
 
     def run(given, callback=None):
-        return SimpleNamespace(poses=given.odom_poses * [1.0, 1.0, 0.0], notes=())
+        poses = given.odom_poses * [1.0, 1.0, 0.0]
+        return SimpleNamespace(poses=poses, notes=(), piece=np.zeros(len(poses), int))
 
     monkeypatch.setattr(log_input, "run", run)
     monkeypatch.setattr(
-        full_rate, "check_map", lambda lidar, poses, scans: SimpleNamespace(warnings=(1,))
+        full_rate, "check_map", lambda lidar, poses, scans, piece: SimpleNamespace(warnings=(1,))
     )
 
 

@@ -61,7 +61,7 @@ class ParticleSpec(NamedTuple):
     z_hit: float = 0.5
     z_rand: float = 0.5
     max_distance: float = 2.0
-    tempering: float = 0.2
+    tempering: float = 0.1
     odometry_std_floor: tuple[float, float] = (0.03, 0.015)
     odometry_slip: tuple[float, float] = (0.1, 0.1)
     recovery: tuple[float, float] = (0.05, 0.5)

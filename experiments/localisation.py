@@ -181,13 +181,12 @@ def text_of(numbers: Numbers) -> str:
         for part, by_method in log.items():
             for method, one in by_method.items():
                 lines.append(f"{name:14} {part:11} {method:15} {_line(part, one)}")
-    for method in numbers["logs"] and METHODS:
-        for row in total_reliability(numbers, method) if method == JAXSLAM else ():
-            if row["steps"]:
-                lines.append(
-                    f"probability from {row['from']:.2f}: {row['steps']:6} steps, "
-                    f"mean {row['probability']:.3f}, right {row['right']:.3f}"
-                )
+    lines += [
+        f"probability from {row['from']:.2f}: {row['steps']:6} steps, "
+        f"mean {row['probability']:.3f}, right {row['right']:.3f}"
+        for row in numbers["reliability"]
+        if row["steps"]
+    ]
     batch = numbers["batch"]
     lines.append(
         f"{batch['robots']} robots in the office, {batch['devices']} devices: "

@@ -44,7 +44,6 @@ class ParticleSpec(NamedTuple):
         sigma_hit: [m] std of the distance of a beam's end from a wall.
         z_hit: Share of the beams that end at a wall,
         z_rand: and that end anywhere.
-        max_distance: [m] beyond which all distances from a wall are alike.
         tempering: Exponent of the product over the beams.
         odometry_std_floor: [m], [rad] least std of the odometry from scan to scan.
         odometry_slip: Its std as fractions of distance and of turn.
@@ -60,7 +59,6 @@ class ParticleSpec(NamedTuple):
     sigma_hit: float = 0.2
     z_hit: float = 0.5
     z_rand: float = 0.5
-    max_distance: float = 2.0
     tempering: float = 0.1
     odometry_std_floor: tuple[float, float] = (0.03, 0.015)
     odometry_slip: tuple[float, float] = (0.1, 0.1)
@@ -177,7 +175,6 @@ def _weights(
     points = ranges[:, None] * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
     look_up = partial(distance_at, PlaceSpec(), place_map.places)
     distance = jax.vmap(lambda pose: look_up(transform(pose, points)))(poses)
-    distance = jnp.minimum(distance, spec.max_distance)
     hit = spec.z_hit * jnp.exp(-0.5 * (distance / spec.sigma_hit) ** 2)
     random = spec.z_rand / place_map.range_max
     share = (hit + random) / (spec.z_hit + random)

@@ -25,7 +25,9 @@ def draw(numbers: Numbers, path: Path) -> None:
         axis.axis("off")
     for axis, (name, log) in zip(axes[0], logs.items(), strict=False):
         _draw_found(axis, name, log)
-    axes[0, 0].legend(frameon=False, fontsize=8, loc="lower right")
+    axes[0, 0].legend(
+        frameon=False, fontsize=8, ncols=2, loc="upper right", bbox_to_anchor=(1.0, 0.95)
+    )
     _draw_reliability(axes[1, 0], numbers["reliability"])
     _draw_errors(axes[1, 1], logs)
     _draw_wrong(axes[1, 2], logs)
@@ -58,9 +60,9 @@ def _draw_reliability(axis, rows: list[Numbers]) -> None:
     x, y = ([row[key] for row in some] for key in ("probability", "right"))
     axis.plot([0, 1], [0, 1], color="0.8")
     axis.plot(x, y, "o-", color=common.BLUE)
-    for row in some:
-        at = (row["probability"], row["right"])
-        axis.annotate(f"{row['steps']:,}", at, (5, -11), textcoords="offset points", fontsize=7)
+    for k, row in enumerate(some):
+        at, beside = (row["probability"], row["right"]), ((5, -11), (-12, 6))[k % 2]
+        axis.annotate(f"{row['steps']:,}", at, beside, textcoords="offset points", fontsize=7)
     axis.set(title="jaxslam, all logs and drives; number of steps")
     axis.set(xlabel="probability that the pose is right", ylabel="share that is right")
 
@@ -101,6 +103,6 @@ def _draw_wrong(axis, logs: Numbers) -> None:
     axis.set_yticks(range(len(labels)), labels, fontsize=8)
     axis.set_xscale("symlog", linthresh=0.1)
     axis.set_xticks([0, 0.1, 0.5, 1, 5, 20, 100], ["0", "0.1", "0.5", "1", "5", "20", "100"])
-    axis.invert_yaxis()
+    axis.set(xlim=(-0.05, 130), ylim=(len(labels) + 0.8, -0.6))
     axis.set(title="wrong but sure, 95 % intervals", xlabel="of the steps that are sure [%]")
-    axis.legend(frameon=False, fontsize=8, loc="lower right")
+    axis.legend(frameon=False, fontsize=8, loc="lower center", ncols=3)

@@ -6,7 +6,8 @@ of the log; the drives are those of the second half of whose first 5 m at least 
 by the reference. A scan is in the map where a keyframe of it had about the same view, within 1.5 m
 and 0.7 rad. The map may be distorted as a whole, which is no error of localisation; so the truth is
 the pose of the nearest keyframe in the map, and from there the motion by the reference.
-**outside**: the other drives of the second half; here nothing is to be found, and sure is wrong.
+**outside**: the other drives of the second half, which may come into the map later; here only what
+is sure and wrong is counted.
 """
 
 from typing import Any, NamedTuple

@@ -52,7 +52,7 @@ def _localise(lidar: Lidar, place_map, scans, odometry):
 
     def one(given):
         info = run_steps(SPEC, lidar, place_map, init(SPEC, lidar), *given, jnp.int32(LENGTH))[1]
-        of_path = info.path_score, info.windows, info.driven
+        of_path = info.path_score, info.windows
         values = jax.vmap(features)(info.log_odds, *of_path, jax.vmap(widest_std)(info.cov))
         return values, info.pose, info.num_hypotheses > 0
 

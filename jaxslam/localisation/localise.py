@@ -260,7 +260,7 @@ def _info(spec: LocaliseSpec, place_map: PlaceMap, query: PlaceQuery, found: Fou
     exists = jnp.isfinite(own.log_weight)
     odds = log_odds(spec, own, found.nowhere)
     scan_score = map_score(spec, place_map, query, own.poses[0])
-    known = own.path_score[0], own.windows[0], own.driven[0], widest_std(own.cov[0])
+    known = own.path_score[0], own.windows[0], widest_std(own.cov[0])
     return LocaliseInfo(
         own.poses[0],
         own.cov[0],

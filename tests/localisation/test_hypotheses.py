@@ -130,10 +130,10 @@ def test_scans_of_the_window_stay_where_they_were_made():
 
 def test_a_pose_is_more_probable_the_more_speaks_for_it():
     def chance(**changed):
-        known = {"odds": 3.0, "score": 0.7, "windows": 4.0, "driven": 2.0, "std": 0.05} | changed
+        known = {"odds": 3.0, "score": 0.7, "windows": 4.0, "std": 0.05} | changed
         return float(probability(features(*(jnp.array(x) for x in known.values()))))
 
     usual = chance()
     assert 0.0 < usual < 1.0
     assert chance(odds=6.0) > usual and chance(score=0.9) > usual and chance(windows=6.0) > usual
-    assert chance(driven=5.0) > usual and chance(std=0.02) > usual
+    assert chance(std=0.02) > usual

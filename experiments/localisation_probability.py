@@ -1,15 +1,11 @@
 """Localisation in a saved map: how its probability was fitted, and whether it holds.
 
 Each log of the folder `--data` is mapped to its middle, and `--starts` robots start anywhere in the
-rest of it and drive on for 60 scans; many are where the map shows nothing, or a place that looks
-the same. A pose is right within `probability.RIGHT` of the truth: the reference, or the smoothed
-trajectory of a log without one, in the frame of the keyframe of the map that is nearest.
-
-The model of `probability` is fitted to all logs but one, each with the same weight, by most
-likelihood, where a wrong pose counts `WRONG_WEIGHT` times: rather too careful than wrong. What it
-says is then compared with what is right on the log that was left out. `coefficients` are those of
-all logs. A pose is sure if its probability is more than 0.9. Steps of robots that come by the same
-place are not independent, so the intervals are too narrow.
+rest and drive on for 60 scans, many of them where the map shows nothing, or what looks the same. A
+pose is right within `probability.RIGHT` of the reference, or of the smoothed trajectory of a log
+without one. The model is fitted to all logs but one, each of the same weight, by most likelihood
+with wrong poses counted `WRONG_WEIGHT` times, and compared with what is right on the one left out;
+`coefficients` are those of all. Steps are not independent, so the intervals are too narrow.
 """
 
 from functools import partial
@@ -22,7 +18,6 @@ from tqdm import tqdm
 
 from experiments import common, log_folder
 from experiments.common import Numbers
-from experiments.log_folder import Log
 from experiments.map_warnings import wilson_interval
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.scan import Lidar
@@ -35,15 +30,12 @@ from jaxslam.localisation.probability import RIGHT, features
 from jaxslam.matching import scan_matching
 from jaxslam.pipeline import log_input, odometry_notes
 
-NAME = "localisation_probability"
-SPEC = LocaliseSpec()
-LENGTH = 60  # scans of a robot
-SURE = 0.9
-WRONG_WEIGHT = 3.0
-BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.9, 0.95, 0.99, 1.0)
+NAME, SPEC = "localisation_probability", LocaliseSpec()
+LENGTH, SURE, WRONG_WEIGHT = 60, 0.9, 3.0  # scans of a robot; probability of a pose that is sure
+BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.9, 0.95, 0.99)  # lower edges
 RIDGE = 1e-4  # of the coefficients: they stay finite where right and wrong are separate
 COLOURS = (common.BLUE, common.RED, common.GREEN, common.ORANGE, common.PINK, common.SKY)
-Answers = tuple[np.ndarray, np.ndarray]  # 1 and features (N, 1 + F) of poses; which are right (N,)
+Answers = tuple[np.ndarray, np.ndarray]  # 1 and features (N, 1 + F) of poses; if right (N,)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -52,14 +44,14 @@ def _localise(lidar: Lidar, place_map, scans, odometry):
 
     def one(given):
         info = run_steps(SPEC, lidar, place_map, init(SPEC, lidar), *given, jnp.int32(LENGTH))[1]
-        of_path = info.path_score, info.windows
-        values = jax.vmap(features)(info.log_odds, *of_path, jax.vmap(widest_std)(info.cov))
+        std = jax.vmap(widest_std)(info.cov)
+        values = jax.vmap(features)(info.log_odds, info.path_score, info.windows, std)
         return values, info.pose, info.num_hypotheses > 0
 
     return jax.lax.map(one, (scans, odometry))
 
 
-def trials(rng: np.random.Generator, log: Log, starts: int) -> Answers:
+def trials(rng: np.random.Generator, log: log_folder.Log, starts: int) -> Answers:
     """Answers at all steps of all robots that have a pose, and a true one."""
     given = log_input.from_laser_log(log.laser_log)
     scans, count = jax.tree.map(np.asarray, given.scans), len(given.increments)
@@ -68,10 +60,13 @@ def trials(rng: np.random.Generator, log: Log, starts: int) -> Answers:
     first = given._replace(**cut, scans=jax.tree.map(lambda x: x[:half], scans))
     mapped = np.asarray(log_input.run(first).poses, float)
     place_map = map_of_scans(SPEC, lidar, mapped, first.scans)
-    options = given.config.scan_matching
     odometry, guessed, _ = odometry_notes.share_out(given.increments, scans, given.after_pause)
-    submap = scan_matching.empty_submap(options, lidar)
-    matches = scan_matching.match_scans(options, lidar, submap, scans, odometry, guessed=guessed)[1]
+    wheels = (
+        scan_matching.empty_submap(options := given.config.scan_matching, lidar),
+        scans,
+        odometry,
+    )
+    matches = scan_matching.match_scans(options, lidar, *wheels, guessed=guessed)[1]
     odometry = np.asarray(matches.increment, float)
     if log.reference is None:
         true = np.asarray(log_input.run(given).poses, float)
@@ -115,16 +110,15 @@ def _chance(coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
 def compare(coefficients: np.ndarray, answers: Answers) -> Numbers:
     """Shares that are right by probability, and those that are sure and wrong."""
     chance, right = _chance(coefficients, answers[0]), answers[1]
-    bins = []
-    for number in range(len(BINS) - 1):
-        own = np.searchsorted(BINS[1:-1], chance, side="right") == number
+    number, bins = np.searchsorted(BINS, chance, side="right"), []
+    for k, low in enumerate(BINS, 1):
+        own = number == k
         share = {"mean": chance[own].mean(), "right": right[own].mean()} if own.any() else {}
-        bins.append({"from": BINS[number], "to": BINS[number + 1], "steps": own.sum()} | share)
+        bins.append({"from": low, "steps": own.sum()} | share)
     sure = chance > SURE
-    wrong = int((sure & ~right).sum())
-    shares = {"wrong_share": wrong / max(sure.sum(), 1), "sure_of_right": sure[right].mean()}
-    interval = wilson_interval(wrong, int(sure.sum()))
-    counts = {"sure": sure.sum(), "wrong": wrong, "interval": interval}
+    wrong, total = int((sure & ~right).sum()), int(sure.sum())
+    counts = {"sure": total, "wrong": wrong, "interval": wilson_interval(wrong, total)}
+    shares = {"wrong_share": wrong / max(total, 1), "sure_of_right": sure[right].mean()}
     return {"coefficients": coefficients, "bins": bins} | counts | shares
 
 
@@ -149,12 +143,11 @@ def main(argv: list[str] | None = None) -> int:
     logs = {log.name: log for log in found[::-1] if log.laser_log.lidar.num_beams > 1}
     if len(logs) < 2:
         raise InputError("has fewer than 2 logs", path=args.data, advice="name a folder of logs")
-    answers = {}
-    for name, log in tqdm(sorted(logs.items()), desc="logs"):
-        answers[name] = trials(np.random.default_rng([args.seed, len(answers)]), log, args.starts)
-    left_out = {}
-    for name in answers:
-        left_out[name] = compare(fit([answers[k] for k in answers if k != name]), answers[name])
+    answers, left_out = {}, {}
+    for number, (name, log) in enumerate(tqdm(sorted(logs.items()), desc="logs")):
+        answers[name] = trials(np.random.default_rng([args.seed, number]), log, args.starts)
+    for name, own in answers.items():
+        left_out[name] = compare(fit([x for x in answers.values() if x is not own]), own)
     of_all = fit(list(answers.values()))
     numbers = {"seed": args.seed, "coefficients": of_all, "left_out": left_out}
     common.save(args.out, NAME, numbers, draw)

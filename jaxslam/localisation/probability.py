@@ -10,7 +10,7 @@ RIGHT = (0.25, float(np.radians(5.0)))
 """[m], [rad] from the true pose within which a pose is right."""
 
 ODDS = (-5.0, 8.0)
-"""Least and largest log odds that are told apart."""
+"""Least and largest log odds that make a difference."""
 
 COEFFICIENTS = (-12.66, 0.03, 17.72, 1.45, -15.19)
 """Of the model: constant, then of the features in their order. Of most likelihood, with wrong poses

@@ -10,6 +10,7 @@ with wrong poses counted `WRONG_WEIGHT` times, and compared with what is right o
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +57,7 @@ def trials(rng: np.random.Generator, log: log_folder.Log, starts: int) -> Answer
     given = log_input.from_laser_log(log.laser_log)
     scans, count = jax.tree.map(np.asarray, given.scans), len(given.increments)
     lidar, half = given.config.frontend.lidar, count // 2
-    cut = {k: x[:half] for k, x in given._asdict().items() if isinstance(x, np.ndarray)}
+    cut: Any = {k: x[:half] for k, x in given._asdict().items() if isinstance(x, np.ndarray)}
     first = given._replace(**cut, scans=jax.tree.map(lambda x: x[:half], scans))
     mapped = np.asarray(log_input.run(first).poses, float)
     place_map = map_of_scans(SPEC, lidar, mapped, first.scans)

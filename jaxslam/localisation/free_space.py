@@ -22,6 +22,7 @@ from jaxslam.core.se2 import transform
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.localisation.config import LocaliseSpec, PlaceMap
+from jaxslam.matching import checks
 from jaxslam.matching.place_fit import PlaceQuery, cells_of, mean_of, score_pose
 from jaxslam.matching.place_index import KEYFRAME_BLOCK, PlaceIndex
 
@@ -44,8 +45,9 @@ def free_space(
         poses: (K, 3) [m, m, rad] of the scanner, map frame.
         scans: [K].
     """
-    count = len(np.asarray(poses))
-    padded = pad_to((np.asarray(poses, np.float64), scans), to=count + -count % KEYFRAME_BLOCK)
+    poses = np.asarray(poses, np.float64)
+    scans = checks.as_scans("scans", lidar, scans, (len(poses),))
+    padded = pad_to((poses, scans), to=len(poses) + -len(poses) % KEYFRAME_BLOCK)
     return _free(spec, lidar, places, jnp.asarray(padded[0], float), padded[1])
 
 

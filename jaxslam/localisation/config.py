@@ -27,6 +27,7 @@ class LocaliseSpec(NamedTuple):
         score_weight: Log likelihood of a score of 1 against one of 0.
         memory: Share of the log likelihood that is kept from one such motion to the next.
         nowhere_score: Score of being at a place that the map does not show.
+        path_windows: Such motions that the mean score of a path is of, at most.
         max_log_odds: Largest difference of two log weights; who has less is given up.
         given_log_odds: Log odds of a pose that is given at the start.
         found_log_odds: Log odds of a pose that the search finds against the best one that is
@@ -52,7 +53,8 @@ class LocaliseSpec(NamedTuple):
     window_distance: tuple[float, float] = (0.5, 0.5)
     score_weight: float = 40.0
     memory: float = 0.9
-    nowhere_score: float = 0.6
+    nowhere_score: float = 0.55
+    path_windows: float = 20.0
     max_log_odds: float = 20.0
     given_log_odds: float = 10.0
     found_log_odds: tuple[float, float] = (-4.0, -10.0)
@@ -68,10 +70,12 @@ class PlaceMap(NamedTuple):
 
     Attributes:
         places: Index: where its walls are, and where a robot may stand.
+        free: (G, H) bool, cells of its grid that the map saw to be free, away from walls.
         range_max: () [m] reach of the scanner that made it; what a robot sees beyond is not used.
     """
 
     places: PlaceIndex
+    free: Array
     range_max: Array
 
 
@@ -83,6 +87,8 @@ class Hypotheses(NamedTuple):
         cov: (H, 3, 3) their covariances, if they are right.
         log_weight: (H,) log likelihood; -inf where there is no hypothesis.
         score: (H,) mean score of the last scans.
+        path_score: (H,) mean score since it was found, of `path_windows` at most.
+        windows: (H,) evidence of that mean, in windows.
         driven: (H,) [m] since it was found.
     """
 
@@ -90,6 +96,8 @@ class Hypotheses(NamedTuple):
     cov: Array
     log_weight: Array
     score: Array
+    path_score: Array
+    windows: Array
     driven: Array
 
 
@@ -135,10 +143,12 @@ class LocaliseInfo(NamedTuple):
     Attributes:
         pose: (3,) [m, m, rad] of the scanner, map frame: the most likely one.
         cov: (3, 3) its covariance, if it is right.
-        probability: () that the pose is within `RIGHT` of the true one, calibrated.
+        probability: () that the pose is within `RIGHT` of the true one, rather too low.
         log_odds: () of the pose against all other hypotheses.
         score: () mean score of the pose over the last scans.
         scan_score: () its score of this scan.
+        path_score: () mean score since the pose was found.
+        windows: () evidence of that mean, in windows.
         driven: () [m] since the pose was found.
         num_hypotheses: () int32.
         searched: () bool, whether the map was searched at this scan.
@@ -150,6 +160,8 @@ class LocaliseInfo(NamedTuple):
     log_odds: Array
     score: Array
     scan_score: Array
+    path_score: Array
+    windows: Array
     driven: Array
     num_hypotheses: Array
     searched: Array
@@ -167,6 +179,7 @@ def check_localise_spec(spec: LocaliseSpec) -> None:
         checks.check_at_least(f"spec.{field}", getattr(spec, field), 1)
     checks.check_at_least("spec.window_scans", spec.window_scans, 2)
     checks.check_positive("spec.point_std", spec.point_std)
+    checks.check_at_least("spec.path_windows", spec.path_windows, 1)
     pairs = "odometry_std_floor start_std given_std window_distance search_distance"
     for field in (*pairs.split(), "gates"):
         for value in getattr(spec, field):

@@ -17,7 +17,8 @@ from jax import lax
 from jaxslam.core.se2 import compose, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.localisation.config import Hypotheses, LocaliseSpec, PlaceMap
-from jaxslam.matching.place_fit import PlaceQuery, fit_pose, score_pose
+from jaxslam.localisation.free_space import map_score
+from jaxslam.matching.place_fit import PlaceQuery, fit_pose
 
 SCORE_MEMORY = 0.7
 """Share of the mean score that is kept from one window to the next."""
@@ -30,7 +31,7 @@ def no_hypotheses(count: int) -> Hypotheses:
     """H hypotheses that do not exist."""
     cov = jnp.broadcast_to(jnp.eye(3), (count, 3, 3))
     nothing = jnp.zeros(count)
-    return Hypotheses(jnp.zeros((count, 3)), cov, nothing - jnp.inf, nothing, nothing)
+    return Hypotheses(jnp.zeros((count, 3)), cov, nothing - jnp.inf, *[nothing] * 4)
 
 
 def std_cov(std: tuple[float, float]) -> Array:
@@ -75,7 +76,7 @@ def fit(
         good = jnp.all(jnp.isfinite(found.pose)) & jnp.all(jnp.isfinite(after))
         pose = jnp.where(good, found.pose, pose)
         pose = pose.at[2].set(wrap_angle(pose[2]))
-        score = score_pose(spec.place, place_map.places, query, pose)
+        score = map_score(spec, place_map, query, pose)
         return pose, jnp.where(good, after, cov), score
 
     poses, cov, scores = jax.vmap(of_one)(hypotheses.poses, hypotheses.cov)
@@ -102,8 +103,16 @@ def weigh(
     weights = kept * hypotheses.log_weight + gain * scores
     weights = jnp.where(jnp.isfinite(hypotheses.log_weight), weights, -jnp.inf)
     mean = hypotheses.score + (1.0 - SCORE_MEMORY**amount) * (scores - hypotheses.score)
+    windows = jnp.minimum(hypotheses.windows + amount, spec.path_windows)
+    share = amount / jnp.maximum(windows, amount + 1e-6)
+    hypotheses = hypotheses._replace(
+        log_weight=weights,
+        score=mean,
+        path_score=hypotheses.path_score + share * (scores - hypotheses.path_score),
+        windows=windows,
+    )
     nowhere = kept * nowhere + gain * spec.nowhere_score
-    return limited(spec, hypotheses._replace(log_weight=weights, score=mean), nowhere)
+    return limited(spec, hypotheses, nowhere)
 
 
 def limited(spec: LocaliseSpec, hypotheses: Hypotheses, nowhere: Array) -> tuple[Hypotheses, Array]:
@@ -121,7 +130,8 @@ def limited(spec: LocaliseSpec, hypotheses: Hypotheses, nowhere: Array) -> tuple
 def keep_best(spec: LocaliseSpec, pool: Hypotheses) -> Hypotheses:
     """The H best of a pool of hypotheses, one of each place.
 
-    One that takes the place of another of the same place keeps the longer of their paths.
+    One that takes the place of another of the same place keeps the longest of their paths, and what
+    was seen on it.
     """
 
     def take(left: Array, _: None) -> tuple[Array, Hypotheses]:
@@ -129,9 +139,15 @@ def keep_best(spec: LocaliseSpec, pool: Hypotheses) -> Hypotheses:
         off = pool.poses - pool.poses[best][None]
         near = jnp.hypot(off[:, 0], off[:, 1]) < spec.place.distinct[0]
         same = near & (jnp.abs(wrap_angle(off[:, 2])) < spec.place.distinct[1])
-        driven = jnp.max(jnp.where(same & jnp.isfinite(left), pool.driven, 0.0))
+        driven = jnp.where(same & jnp.isfinite(left), pool.driven, -1.0)
+        longest = jnp.where(driven[best] >= jnp.max(driven), best, jnp.argmax(driven))
         chosen = jax.tree.map(lambda x: x[best], pool)
-        chosen = chosen._replace(log_weight=left[best], driven=driven)
+        chosen = chosen._replace(
+            log_weight=left[best],
+            path_score=pool.path_score[longest],
+            windows=pool.windows[longest],
+            driven=pool.driven[longest],
+        )
         return jnp.where(same, -jnp.inf, left), chosen
 
     return lax.scan(take, pool.log_weight, length=spec.num_hypotheses)[1]

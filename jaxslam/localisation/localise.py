@@ -44,6 +44,7 @@ from jaxslam.localisation.config import (
     PlaceMap,
     check_localise_spec,
 )
+from jaxslam.localisation.free_space import free_space, map_score
 from jaxslam.localisation.hypotheses import (
     evidence,
     fit,
@@ -68,7 +69,7 @@ from jaxslam.localisation.search import (
 )
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.matching import checks
-from jaxslam.matching.place_fit import PlaceQuery, score_pose
+from jaxslam.matching.place_fit import PlaceQuery
 from jaxslam.matching.place_index import build_index
 from jaxslam.matching.place_recognition import make_query
 
@@ -100,7 +101,8 @@ def map_of_scans(spec: LocaliseSpec, lidar: Lidar, poses: AnyArray, scans: Scan)
     """
     check_localise_spec(spec)
     places = build_index(spec.place, lidar, poses, scans)
-    return PlaceMap(places, jnp.asarray(lidar.range_max, float))
+    free = free_space(spec, lidar, places, poses, scans)
+    return PlaceMap(places, free, jnp.asarray(lidar.range_max, float))
 
 
 def init(spec: LocaliseSpec, lidar: Lidar, pose: Any = None) -> LocaliseState:
@@ -257,15 +259,17 @@ def _info(spec: LocaliseSpec, place_map: PlaceMap, query: PlaceQuery, found: Fou
     own = found.hypotheses
     exists = jnp.isfinite(own.log_weight)
     odds = log_odds(spec, own, found.nowhere)
-    scan_score = score_pose(spec.place, place_map.places, query, own.poses[0])
-    values = features(odds, own.score[0], own.driven[0], widest_std(own.cov[0]))
+    scan_score = map_score(spec, place_map, query, own.poses[0])
+    known = own.path_score[0], own.windows[0], widest_std(own.cov[0])
     return LocaliseInfo(
         own.poses[0],
         own.cov[0],
-        jnp.where(exists[0], probability(values), 0.0),
+        jnp.where(exists[0], probability(features(odds, *known)), 0.0),
         odds,
         own.score[0],
         scan_score,
+        own.path_score[0],
+        own.windows[0],
         own.driven[0],
         jnp.sum(exists, dtype=jnp.int32),
         jnp.array(False),

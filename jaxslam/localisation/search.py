@@ -20,6 +20,7 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import compose, relative
 from jaxslam.core.types import Array
 from jaxslam.localisation.config import Hypotheses, LocaliseSpec, PlaceMap, Window
+from jaxslam.localisation.free_space import map_score
 from jaxslam.localisation.hypotheses import (
     fit,
     inverse,
@@ -28,7 +29,7 @@ from jaxslam.localisation.hypotheses import (
     std_cov,
     windows_moved,
 )
-from jaxslam.matching.place_fit import PlaceQuery, fit_pose, score_pose
+from jaxslam.matching.place_fit import PlaceQuery, fit_pose
 from jaxslam.matching.place_recognition import KERNEL, find_places, make_query
 
 LONG_TRACKED = 10.0
@@ -132,14 +133,18 @@ def _search(
     weight = spec.score_weight * jnp.sum(used, dtype=scores.dtype)
     of_new, of_old = spec.found_log_odds
     tracked_share = jnp.append(jnp.minimum(own.driven / LONG_TRACKED, 1.0), 0.0)[best]
-    log_weight = weights[best] + weight * (places.score - scores[best])
+    of_places = jax.vmap(partial(map_score, spec, place_map, query))(places.poses)
+    of_places = jnp.where(jnp.isfinite(places.score), of_places, -jnp.inf)
+    log_weight = weights[best] + weight * (of_places - scores[best])
     log_weight += of_new + tracked_share * (of_old - of_new)
     count = len(places.score)
     candidates = Hypotheses(
         places.poses,
         jnp.broadcast_to(std_cov(spec.start_std), (count, 3, 3)),
         log_weight,
-        places.score,
+        of_places,
+        of_places,
+        jnp.full(count, jnp.sum(used, dtype=scores.dtype)),
         jnp.zeros(count),
     )
     # The window is as good as the odometry: the last scan alone says where the robot is now.
@@ -154,7 +159,7 @@ def _window_score(spec: LocaliseSpec, place_map: PlaceMap, query: PlaceQuery, po
     stds = tuple(KERNEL * gate for gate in place.fine_gates)
     prior = inverse(std_cov(spec.start_std))
     fitted = fit_pose(place, place_map.places, query, place.fine_gates, stds, pose, prior)
-    return score_pose(place, place_map.places, query, fitted.pose)
+    return map_score(spec, place_map, query, fitted.pose)
 
 
 def is_wanted(

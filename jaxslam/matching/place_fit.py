@@ -91,7 +91,7 @@ def fit_pose(
     def step(fit: PoseFit, now: tuple[Array, Array]) -> tuple[PoseFit, None]:
         pose, (gate, std) = fit.pose, now
         points = transform(pose, query.points)
-        cell = _cells(spec, index, points)
+        cell = cells_of(spec, index, points)
         normal, distance = index.normal[cell], index.distance[cell]
         error = dot(normal, points - index.origin[None]) - index.offset[cell]
         facing = dot(normal, query.normal @ rotation(pose[2]).T) > 0.5
@@ -116,7 +116,7 @@ def score_pose(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, pose: Arra
         return jnp.exp(-0.5 * (distance / spec.std) ** 2)
 
     points = transform(pose, query.points)
-    cell = _cells(spec, index, points)
+    cell = cells_of(spec, index, points)
     distance = index.distance[cell]
     across = dot(index.normal[cell], points - index.origin[None]) - index.offset[cell]
     on_line = jnp.where(distance < ON_LINE * spec.cell, on_wall(across), 0.0)
@@ -130,10 +130,10 @@ def score_pose(spec: PlaceSpec, index: PlaceIndex, query: PlaceQuery, pose: Arra
 
 def distance_at(spec: PlaceSpec, index: PlaceIndex, points: Array) -> Array:
     """Distances (N,) [m] from the nearest wall, of points (N, 2) [m] of the map frame."""
-    return index.distance[_cells(spec, index, points)]
+    return index.distance[cells_of(spec, index, points)]
 
 
-def _cells(spec: PlaceSpec, index: PlaceIndex, points: Array) -> tuple[Array, Array]:
+def cells_of(spec: PlaceSpec, index: PlaceIndex, points: Array) -> tuple[Array, Array]:
     """Cells (N,), (N,) int32 of points (N, 2) [m] of the map frame; those of its edge beyond it."""
     cell = jnp.round((points - index.origin[None]) / spec.cell).astype(jnp.int32)
     height, width = index.distance.shape

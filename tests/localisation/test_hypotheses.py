@@ -21,6 +21,8 @@ def some(rng, count, spread=1.0):
         jnp.asarray(root @ root.swapaxes(1, 2) + 0.1 * np.eye(3)),
         jnp.asarray(np.where(rng.random(count) < 0.7, -rng.exponential(5.0, count), -np.inf)),
         jnp.asarray(rng.random(count)),
+        jnp.asarray(rng.random(count)),
+        jnp.asarray(rng.uniform(1.0, 9.0, count)),
         jnp.asarray(rng.exponential(5.0, count)),
     )
 
@@ -39,7 +41,9 @@ def test_the_best_of_each_place_are_kept(seed):
         same = (np.hypot(off[:, 0], off[:, 1]) < 0.5) & (turn < 0.17)
         np.testing.assert_array_equal(kept.poses[slot], pool.poses[left[0]])
         assert kept.log_weight[slot] == pool.log_weight[left[0]]
-        assert kept.driven[slot] == max(pool.driven[k] for k in left if same[k])
+        longest = max((k for k in left if same[k]), key=lambda k: pool.driven[k])
+        for field in ("path_score", "windows", "driven"):
+            assert getattr(kept, field)[slot] == getattr(pool, field)[longest]
         left = [k for k in left if not same[k]]
 
 
@@ -65,10 +69,26 @@ def test_a_robot_that_stands_gathers_no_evidence_and_one_that_drives_does():
     still, nowhere = hypotheses.weigh(SPEC, own, jnp.array(-1.0), scores, jnp.array(0.0))
     np.testing.assert_allclose(still.log_weight, own.log_weight)
     np.testing.assert_allclose([nowhere, *still.score], [-1.0, *own.score])
+    np.testing.assert_allclose(still.path_score, own.path_score)
     moved, gone = hypotheses.weigh(SPEC, own, jnp.array(-1.0), scores, jnp.array(1.0))
     gain = SPEC.score_weight * (0.9 - SPEC.nowhere_score)
     np.testing.assert_allclose(moved.log_weight, SPEC.memory * own.log_weight)
     np.testing.assert_allclose(gone, -SPEC.memory - gain)
+
+
+def test_the_score_of_a_path_is_the_mean_of_its_scans_weighed_by_their_evidence():
+    rng = np.random.default_rng(4)
+    own = some(rng, 8)
+    total, scores = np.asarray(own.path_score * own.windows), rng.random((9, 8))
+    amounts = rng.uniform(0.2, 1.0, 9)
+    for now, amount in zip(scores, amounts, strict=True):
+        own = hypotheses.weigh(SPEC, own, jnp.array(0.0), jnp.asarray(now), jnp.array(amount))[0]
+        total = total + amount * now
+    np.testing.assert_allclose(own.path_score * own.windows, total)
+    for _ in range(200):  # long ago is forgotten
+        own = hypotheses.weigh(SPEC, own, jnp.array(0.0), jnp.full(8, 0.7), jnp.array(1.0))[0]
+    np.testing.assert_allclose(own.windows, SPEC.path_windows)
+    np.testing.assert_allclose(own.path_score, 0.7, atol=1e-3)
 
 
 def test_who_explains_much_less_is_given_up_but_nowhere_never():
@@ -110,10 +130,10 @@ def test_scans_of_the_window_stay_where_they_were_made():
 
 def test_a_pose_is_more_probable_the_more_speaks_for_it():
     def chance(**changed):
-        known = {"log_odds": 10.0, "score": 0.8, "driven": 2.0, "std": 0.05} | changed
+        known = {"odds": 3.0, "score": 0.7, "windows": 4.0, "std": 0.05} | changed
         return float(probability(features(*(jnp.array(x) for x in known.values()))))
 
     usual = chance()
     assert 0.0 < usual < 1.0
-    assert chance(log_odds=20.0) > usual and chance(score=0.9) > usual
-    assert chance(driven=5.0) > usual and chance(std=0.02) > usual
+    assert chance(odds=6.0) > usual and chance(score=0.9) > usual and chance(windows=6.0) > usual
+    assert chance(std=0.02) > usual

@@ -24,7 +24,8 @@ from jaxslam.cli.options import (
     require_odometry,
     stopwatch,
 )
-from jaxslam.cli.run_results import RecordedDrive, RunContext, without_errors
+from jaxslam.cli.run_evaluation import RecordedDrive, without_errors
+from jaxslam.cli.run_results import RunContext
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation import log_errors
@@ -176,6 +177,7 @@ def run(
         }
         if folders:
             extra["other_parts"] = folders
+        extra["mended"] += _left_from_before(out, folders, len(drives))
         numbers, num_warnings = run_results.write(context, result, out_dir, extra)
         for name, part in zip(folders, result.other_parts, strict=True):
             (out_dir / name).mkdir()
@@ -200,6 +202,16 @@ def _read_map(folder_of_map: Path) -> tuple[SavedMap, AnnotatedMap | None]:
         next_id: Any = np.int32(max(int(saved.belief.next_id), annotated.next_id))
         saved = saved._replace(belief=saved.belief._replace(next_id=next_id))
     return saved, annotated
+
+
+def _left_from_before(out: Path, folders: Sequence[str], num_logs: int) -> list[str]:
+    """A note on results of an earlier run that this one does not replace."""
+    own = (
+        {f"trajectory.{k + 1}.tum" for k in range(num_logs)} if num_logs > 1 else {"trajectory.tum"}
+    )
+    found = {path.name for pattern in ("part_*", "trajectory*.tum") for path in out.glob(pattern)}
+    left = sorted(found - own - set(folders))
+    return [f"{out}: {', '.join(left)} of an earlier run stay there"] if left else []
 
 
 class _Reference(NamedTuple):

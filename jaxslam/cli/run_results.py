@@ -8,11 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli import report
-from jaxslam.core.logs import LaserLog, Relations
+from jaxslam.cli.run_evaluation import (
+    RecordedDrive,
+    breaks_of,
+    drive_in_map,
+    errors_of,
+    not_used,
+)
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.se2_np import compose, relative, trajectories_as_one
+from jaxslam.core.time_series import match_times
 from jaxslam.evaluation import log_errors, map_consistency
-from jaxslam.evaluation.log_errors import Trajectory
+from jaxslam.evaluation.map_consistency import MapConsistency
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
@@ -21,26 +28,6 @@ from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.log_input import LogInput
 from jaxslam.pipeline.results import SlamResult
-
-ROUNDING = 1e-3  # [s] of written times
-
-
-class RecordedDrive(NamedTuple):
-    """One of the logs of a run.
-
-    Attributes:
-        path: Its file.
-        log: What it holds.
-        reference: Reference trajectory, if there is one.
-        relations: Verified relative poses, if there are any.
-        dead_reckoning: Errors of its odometry.
-    """
-
-    path: Path
-    log: LaserLog
-    reference: Trajectory | None
-    relations: Relations | None
-    dead_reckoning: Metrics
 
 
 class RunContext(NamedTuple):
@@ -67,27 +54,6 @@ class RunContext(NamedTuple):
     annotated_map: AnnotatedMap | None = None
 
 
-def without_errors(drive: RecordedDrive) -> RecordedDrive:
-    """The same log, without anything to evaluate it with."""
-    return drive._replace(reference=None, relations=None, dead_reckoning={})
-
-
-class _DriveInMap(NamedTuple):
-    """The scans of a log that are in a map.
-
-    Attributes:
-        rows: (N,) int their numbers among all scans of the run.
-        log: The log of these scans alone.
-        result: The result of these scans alone; of keyframes, only numbers and covariances.
-        odometry: (N, 3) [m, m, rad] poses by the wheels, from the first pose in the map on.
-    """
-
-    rows: np.ndarray
-    log: LaserLog
-    result: SlamResult
-    odometry: np.ndarray
-
-
 def write(
     context: RunContext, result: SlamResult, out_dir: Path, extra: Metrics
 ) -> tuple[Metrics, int]:
@@ -104,9 +70,7 @@ def write(
     """
     given = context.given
     config, scans = given.config, given.scans
-    consistency = map_consistency.check_map(
-        config.frontend.lidar, result.poses, scans, piece=result.piece
-    )
+    consistency = _check_map(context, result)
     own = np.flatnonzero(np.isfinite(result.poses).all(axis=1))
     numbers: Metrics = extra | {
         "scans": len(own),
@@ -117,18 +81,21 @@ def write(
         "map_consistency": consistency.metrics(),
     }
     several, path_length, first_row = len(context.drives) > 1, 0.0, 0
+    notes: list[str] = []
     lines: dict[str, list[np.ndarray]] = {"odometry": [], "reference": []}
     errors = np.full((len(result.keyframes), 3), np.nan)
     for number, drive in enumerate(context.drives):
-        here = _drive_in_map(given, result, drive, first_row)
+        here = drive_in_map(given, result, drive, first_row)
         first_row += len(drive.log.times)
+        notes += not_used(drive, here)
         if not len(here.rows):
             continue
         path = here.result.poses if given.match_scans else here.odometry
-        length = sum(log_errors.path_length(x) for x in np.split(path, _breaks(here.result)))
+        length = sum(log_errors.path_length(x) for x in np.split(path, breaks_of(here.result)))
         path_length += length
         at_start = number == 0 and result.saved_poses is None
-        about, error = _errors(context, drive, here, at_start=at_start)
+        about, error, more = errors_of(drive, here, smooth=context.smooth, at_start=at_start)
+        notes += more
         if error is not None:
             errors[np.isin(result.keyframes, here.rows)] = error
         if several:
@@ -144,11 +111,12 @@ def write(
             poses = compose(poses, base)
         tum.write(out_dir / f"trajectory{suffix}.tum", here.log.times, poses)
         lines["odometry"].append(here.odometry)
-        if drive.reference is not None:
+        if drive.reference is not None and len(match_times(here.log.times, drive.reference[0])) > 1:
             lines["reference"].append(
                 log_errors.reference_in_map(here.log.times, here.result.poses, drive.reference)
             )
     numbers["path_length_m"] = path_length
+    numbers["mended"] = [*numbers.get("mended", ()), *notes]
     saved, old = context.saved_map, context.annotated_map
     if result.saved_poses is None:  # a map of its own
         saved, old = None, None
@@ -184,7 +152,7 @@ def write(
             out_dir / "run.gif",
             config,
             context.params,
-            measurements,
+            measurements if saved is None else _from_first(measurements),
             of_keyframes,
             result.poses[result.keyframes],
             np.concatenate(lines["odometry"])[at],
@@ -192,82 +160,46 @@ def write(
     return numbers, len(consistency.warnings)
 
 
-def _drive_in_map(
-    given: LogInput, result: SlamResult, drive: RecordedDrive, first_row: int
-) -> _DriveInMap:
-    """The scans of a log that are in a map.
-
-    Args:
-        given: All logs of the run.
-        result: The map.
-        drive: The log.
-        first_row: Number of its first scan among those of all logs.
-    """
-    log = drive.log
-    of_log = slice(first_row, first_row + len(log.times))
-    own = np.flatnonzero(np.isfinite(result.poses[of_log]).all(axis=1))
-    rows = first_row + own
-    if len(own) < len(log.times):
-        log = log._replace(
-            times=log.times[own], odom_poses=log.odom_poses[own], ranges=log.ranges[own]
-        )
-    of_keyframes = np.isin(result.keyframes, rows)
-    of_drive = result._replace(
-        poses=result.poses[rows],
-        online_poses=result.online_poses[rows],
-        keyframes=np.searchsorted(rows, result.keyframes[of_keyframes]),
-        info=jax.tree.map(lambda x: np.asarray(x)[of_keyframes], result.info),
-        piece=result.piece[rows],
+def _check_map(context: RunContext, result: SlamResult) -> MapConsistency:
+    """Whether the scans agree with the map, and with the saved one that it goes on in."""
+    lidar, scans, saved = (
+        context.given.config.frontend.lidar,
+        context.given.scans,
+        result.saved_poses,
     )
-    odometry = given.odom_poses[rows]
-    if len(rows):
-        odometry = compose(result.poses[rows[0]], relative(odometry[0], odometry))
-    return _DriveInMap(rows, log, of_drive, odometry)
+    if saved is None or context.saved_map is None:
+        return map_consistency.check_map(lidar, result.poses, scans, piece=result.piece)
+    count = len(saved)
+    both = jax.tree.map(lambda *x: np.concatenate(x), context.saved_map.scans, scans)
+    piece = np.concatenate([np.full(count, -2), result.piece])  # -1 are scans without a pose
+    found = map_consistency.check_map(
+        lidar, np.concatenate([saved, result.poses]), both, piece=piece
+    )
+    new = found.scan >= count
+    warnings = tuple(
+        warning._replace(
+            first_scan=max(warning.first_scan - count, 0), last_scan=warning.last_scan - count
+        )
+        for warning in found.warnings
+        if warning.last_scan >= count
+    )
+    return found._replace(
+        scan=found.scan[new] - count,
+        poses=found.poses[new],
+        step_contradiction=found.step_contradiction[new[1:]][1:],
+        step_confirmation=found.step_confirmation[new[1:]][1:],
+        visit_contradiction=found.visit_contradiction[new],
+        warnings=warnings,
+    )
 
 
-def _errors(
-    context: RunContext, drive: RecordedDrive, here: _DriveInMap, *, at_start: bool
-) -> tuple[Metrics, np.ndarray | None]:
-    """Errors of a log's trajectory, and of the filter if it was smoothed; and of its keyframes.
-
-    Args:
-        context: Of the run.
-        drive: The log.
-        here: Its scans in the map.
-        at_start: Whether the map begins with this log, so that covariances are since its start.
-    """
-    numbers: Metrics = {}
-    log, result, error = here.log, here.result, None
-    reference, relations = drive.reference, drive.relations
-    if relations is not None:
-        relations = _known_times(log, result, relations)
-    if reference is not None and log_errors.has_heading(reference) and at_start:
-        error = log_errors.errors_since_start(log.times, result.online_poses, reference)
-        error = error[result.keyframes]
-        numbers["nees"] = log_errors.mean_nees_per_dof(error, np.asarray(result.info.pose_cov))
-    if reference is not None or relations is not None:
-        numbers |= log_errors.errors_against(log, result.poses, reference, relations)
-        if context.smooth:
-            numbers["filter"] = log_errors.errors_against(
-                log, result.online_poses, reference, relations
-            )
-    if drive.dead_reckoning:
-        numbers["dead_reckoning"] = drive.dead_reckoning
-    return numbers, error
-
-
-def _known_times(log: LaserLog, result: SlamResult, relations: Relations) -> Relations:
-    """The relations between times that have a pose: while a drive was broken there is none."""
-    first = _breaks(result)
-    start, end = log.times[first - 1] + ROUNDING, log.times[first] - ROUNDING
-
-    def unknown(times: np.ndarray) -> np.ndarray:
-        return ((times[:, None] > start[None]) & (times[:, None] < end[None])).any(axis=1)
-
-    kept = ~(unknown(relations.t1) | unknown(relations.t2))
-    return Relations(*(x[kept] for x in relations))
-
-
-def _breaks(result: SlamResult) -> np.ndarray:
-    """Indices of the first scans of pieces, without that of the first one."""
-    return np.flatnonzero(np.diff(result.piece)) + 1
+def _from_first(measurements: Measurement) -> Measurement:
+    """Measurements [K] of the filter, the first without the motion from a saved map to it."""
+    match = measurements.scan_match
+    if match is None or match.expected is None:
+        return measurements
+    increment, expected = np.array(match.increment), np.array(match.expected)
+    increment[0] = expected[0] = 0.0
+    return measurements._replace(
+        scan_match=match._replace(increment=increment, expected=expected)  # type: ignore[arg-type]
+    )

@@ -122,9 +122,9 @@ def check_map(
     posed = posed_scans(lidar, poses[finite], ranges[finite], hit[finite])
     posed = posed._replace(number=finite[posed.number])
     comparison, num_scans = ScanComparison(posed), len(posed.number)
-    steps, visits = _neighbours(num_scans), _earlier_visits(posed)
-    by_step, by_visit = comparison.compare(*steps.T), comparison.compare(*visits.T)
     of_scan = piece[posed.number]
+    steps, visits = _neighbours(num_scans), _earlier_visits(posed, of_scan)
+    by_step, by_visit = comparison.compare(*steps.T), comparison.compare(*visits.T)
     by_step = by_step.of_pairs(of_scan[steps[:, 0]] == of_scan[steps[:, 1]])
     before, after = _lasting(steps, by_step, num_scans)
     step_contradiction, step_confirmation = _across_steps(steps, by_step, before, after)
@@ -153,14 +153,20 @@ def _neighbours(num_scans: int) -> np.ndarray:
     return every[every[:, 1] < num_scans]
 
 
-def _earlier_visits(posed: PosedScans) -> np.ndarray:
-    """Pairs (P, 2) of a scan and the scan of an earlier visit that is most like it in pose."""
+def _earlier_visits(posed: PosedScans, piece: np.ndarray) -> np.ndarray:
+    """Pairs (P, 2) of a scan and the scan of an earlier visit that is most like it in pose.
+
+    Args:
+        posed: K scans.
+        piece: (K,) int piece of the drive of each; another piece is another visit.
+    """
     pairs = []
     near = cKDTree(posed.poses[:, :2]).query_ball_point(posed.poses[:, :2], VISIT_RADIUS)
     for scan, others in enumerate(near):
         earlier = np.sort(np.array(others))
         path = posed.travelled[scan] - posed.travelled[earlier]
-        earlier = earlier[(earlier < scan) & (path > VISIT_SEPARATION)]
+        other = (path > VISIT_SEPARATION) | (piece[earlier] != piece[scan])
+        earlier = earlier[(earlier < scan) & other]
         visit = np.cumsum(np.diff(earlier, prepend=earlier[:1]) > NUM_NEIGHBOURS)
         offset = posed.poses[earlier] - posed.poses[scan]
         cost = np.hypot(offset[:, 0], offset[:, 1]) + 0.5 * np.abs(wrap_angle(offset[:, 2]))

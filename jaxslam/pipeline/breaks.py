@@ -41,6 +41,8 @@ def pauses(times: np.ndarray) -> np.ndarray:
         ValueError: They are not finite numbers.
     """
     times = as_float64("times", times, ("T",))
+    if not np.isfinite(times).all():
+        raise ValueError(f"times[{int(np.argmin(np.isfinite(times)))}] is not a finite number")
     interval = np.diff(times, prepend=times[:1])
     usual = np.median(interval[1:]) if len(times) > 1 else 0.0
     return interval > max(PAUSE[0] * usual, PAUSE[1])

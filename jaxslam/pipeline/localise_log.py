@@ -47,6 +47,8 @@ def localise_log(
 ) -> LogLocalisation:
     """Localise the robot of a log in a map, by what is known up to each scan.
 
+    Latched odometry is the one exception: its leaps are shared out over the few scans before them.
+
     Args:
         spec: Options.
         place_map: By `localise.make_map`.

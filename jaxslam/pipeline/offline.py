@@ -84,7 +84,8 @@ def run_slam(
             it is a map of its own, and a note says so. `start` is then not used.
         match_scans: Whether scans are matched, and the increments fused with the odometry.
         smooth: Whether the trajectory is smoothed at the end.
-        callback: Called after each chunk of keyframes with the state and the result of the chunk;
+        callback: Called after each chunk of keyframes with the state and the result of the chunk,
+            of a broken drive for the first piece, and then for those that are joined to others;
             the submap of the state may already hold later scans.
 
     Raises:
@@ -131,12 +132,18 @@ def run_slam(
     if saved_map is not None and main.saved_poses is None:
         notes += ("no place of the saved map was found again: this is a map of its own",)
     for part in others:
-        scans_of_part = np.flatnonzero(part.piece >= 0)
+        spans = _spans(part.piece)
         notes += (
-            f"scans {scans_of_part[0]}-{scans_of_part[-1]} share no place with the rest that was "
-            "found again: they are a map of their own",
+            f"scans {spans} share no place with the rest that was found again: they are a map of "
+            "their own",
         )
     return main._replace(notes=notes + main.notes, other_parts=tuple(others))
+
+
+def _spans(piece: np.ndarray) -> str:
+    """First and last scans of the pieces (T,) in a map."""
+    numbers = [np.flatnonzero(piece == k) for k in np.unique(piece[piece >= 0])]
+    return " and ".join(f"{own[0]}-{own[-1]}" for own in numbers)
 
 
 def _importance(result: SlamResult) -> tuple[bool, int]:
@@ -220,8 +227,6 @@ def _several_pieces(
                 filtered = _filter(run, filtered, [pieces.after_gap(chunks[0], gap), *chunks[1:]])
             results.append(_result(run, filtered, np.concatenate(own), _notes(group, alone)))
         elif number != pieces.SAVED:
-            if number > 0 and run.callback is not None:
-                run.callback(alone[number].state, alone[number].results[-1])
             results.append(found[number])
     return results
 
@@ -239,11 +244,11 @@ def _notes(group: Group, alone: Mapping[int, _Filtered]) -> tuple[str, ...]:
         chunks = alone[number].chunks
         first, last = (chunks[0].keyframes[0], chunks[-1].keyframes[-1]) if chunks else (0, 0)
         names.append(f"scans {first}-{last}" if chunks else "the saved map")
-    places = min(join.num_places for join in group.joins)
-    how = f"by {places} places that were found again"
-    if places == 0:
-        how = "as scan matching has it across the break"
-    return (f"{' and '.join(names)} were mapped alone, and joined {how}",)
+    places = [join.num_places for join in group.joins if join.num_places]
+    how = [f"by {min(places)} places that were found again"] if places else []
+    if len(places) < len(group.joins):
+        how.append("as scan matching has it across a break")
+    return (f"{' and '.join(names)} were mapped alone, and joined {', or '.join(how)}",)
 
 
 def _result(

@@ -24,7 +24,8 @@ class SlamResult(NamedTuple):
         online_poses: (T, 3) float64 [m, m, rad] estimates at the time: those of the filter, and
             between keyframes the matched motion since.
         keyframes: (K,) int numbers of the keyframes, which the filter was given; the first and the
-            last scan are among them. All scans where `config.keyframe_distance` is None.
+            last scan of each piece are among them. All scans where `config.keyframe_distance` is
+            None.
         belief: Of the filter after the last scan; if smoothed, with the smoothed last pose and
             landmark positions, and still the covariance of the filter.
         info: [K] diagnostics of the filter, with its estimates at the time.

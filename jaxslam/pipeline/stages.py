@@ -192,11 +192,12 @@ def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterato
 
     latest, is_start = submap, drive.new_drive.copy()
     across: dict[int, np.ndarray] = {}
+    has_shown = False  # whether the piece has a scan that shows a place
     is_start[0] = False
     num_returns = np.asarray(drive.scans.hit).sum(axis=1)
 
     def match(start: int) -> list[_MatchedPart]:
-        nonlocal latest
+        nonlocal latest, has_shown
         found: list[_MatchedPart] = []
         stop = min(start + chunks.CHUNK, len(drive.odometry))
         while start < stop:
@@ -205,9 +206,12 @@ def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterato
             increments, guessed = drive.odometry[some].copy(), drive.guessed[some].copy()
             if is_start[start]:
                 latest, increments[0], guessed[0] = submap, 0.0, False
+                has_shown = False
             scans = jax.tree.map(lambda x, some=some: x[some], drive.scans)
             after, matches = chunks.match_chunk(config, latest, increments, scans, guessed)
-            may_break = ~is_start[some]
+            shows = num_returns[some] >= breaks.MIN_RETURNS
+            shown_before = has_shown | (np.cumsum(shows) > shows)
+            may_break = shown_before & ~is_start[some]
             may_break[0] &= start > 0
             broken = breaks.first_break(
                 matches,
@@ -222,7 +226,7 @@ def _match_ahead(config: Config, submap: Submap | None, drive: Drive) -> Iterato
                     across[start + broken] = np.asarray(matches.increment[broken], float)
             if count:
                 matches = jax.tree.map(lambda x, count=count: x[:count], matches)
-                latest = after
+                latest, has_shown = after, has_shown or bool(shows[:count].any())
                 part = _MatchedPart(after, increments[:count], matches, is_start[start])
                 found.append(part._replace(across_break=across.get(start)))
             start += count

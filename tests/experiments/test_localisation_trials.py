@@ -159,7 +159,7 @@ def test_the_weight_of_a_particle_is_that_of_the_slow_version():
     field = jnp.asarray(rng.uniform(0, 0.6, (60, 50)))
     none = jnp.zeros(0)
     index = PlaceIndex(jnp.array([-1.0, -2.0]), field, none, none, none, none, none)
-    place_map = localisation.PlaceMap(index, jnp.array(6.0))
+    place_map = localisation.PlaceMap(index, none, jnp.array(6.0))
     ranges, hit = rng.uniform(0.5, 4, 7), np.array([True, True, False, True, False, True, True])
     ranges[4] = 7.0  # beyond the reach of the map's scanner
     poses = rng.uniform(-0.5, 2, (5, 3))

@@ -248,18 +248,7 @@ def main(argv: list[str] | None = None) -> int:
             raise InputError(f"{getattr(args, flag)} is too small", field=f"--{flag}")
     use_cpu_devices()
     enable_caches()
-    logs = log_folder.find_logs(log_folder.checked_folder(args.data), installed=False)
-    names = log_folder.unique_names(logs)
-    chosen = {
-        name: log
-        for name, log in zip(names, logs, strict=True)
-        if log.reference is not None and len(log.laser_log.times) <= MAX_SCANS
-    }
-    if not chosen:
-        raise InputError(
-            f"no log with a reference trajectory and at most {MAX_SCANS} scans",
-            advice="name a folder of such logs",
-        )
+    chosen = log_folder.with_reference(args.data, MAX_SCANS)
     about = {"data": args.data, "starts": args.starts, "seed": args.seed, "batch": args.batch}
     cache = common.ResultCache(args.out / f"{NAME}_parts", about)
     found = {

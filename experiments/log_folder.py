@@ -69,6 +69,30 @@ def find_logs(folder: Path | None, *, installed: bool = True) -> list[Log]:
     return [_read(name, path, files) for name, path in paths]
 
 
+def with_reference(name: str, max_scans: int) -> dict[str, Log]:
+    """The logs of a folder that have a reference and few scans, by unique names.
+
+    Args:
+        name: Of the folder, as it was given.
+        max_scans: Of a log.
+
+    Raises:
+        InputError: There is no such folder, or no such log.
+    """
+    logs = find_logs(checked_folder(name), installed=False)
+    chosen = {
+        own: log
+        for own, log in zip(unique_names(logs), logs, strict=True)
+        if log.reference is not None and len(log.laser_log.times) <= max_scans
+    }
+    if not chosen:
+        raise InputError(
+            f"no log with a reference trajectory and at most {max_scans} scans",
+            advice="name a folder of such logs",
+        )
+    return chosen
+
+
 def is_log(path: Path) -> bool:
     """Whether a path is a log by its suffix, or the folder of a bag."""
     return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()

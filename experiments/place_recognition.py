@@ -261,18 +261,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.plans < 1:
         raise InputError(f"{args.plans} is too small", field="--plans")
     enable_caches()
-    logs = log_folder.find_logs(log_folder.checked_folder(args.data), installed=False)
-    names = log_folder.unique_names(logs)
-    chosen = {
-        name: log
-        for name, log in zip(names, logs, strict=True)
-        if log.reference is not None and len(log.laser_log.times) <= MAX_KEYFRAMES
-    }
-    if not chosen:
-        raise InputError(
-            f"no log with a reference trajectory and at most {MAX_KEYFRAMES} scans",
-            advice="name a folder of such logs",
-        )
+    chosen = log_folder.with_reference(args.data, MAX_KEYFRAMES)
     about = {"data": args.data, "every": args.every, "seed": args.seed, "plans": args.plans}
     cache = common.ResultCache(args.out / f"{NAME}_parts", about)
     found = {name: cache(name, partial(run_log, log, args.every)) for name, log in chosen.items()}

@@ -166,3 +166,12 @@ def pad_to(items: Any, *, to: int) -> Any:
         return xp.concatenate([x, xp.repeat(x[-1:], missing, axis=0)])
 
     return jax.tree.map(lengthen, items)
+
+
+def on_device(items: Any) -> Any:
+    """NumPy arrays as JAX arrays, real numbers in JAX's default precision."""
+
+    def put(x: np.ndarray) -> Array:
+        return jnp.asarray(x, float if x.dtype.kind == "f" else None)
+
+    return jax.tree.map(put, items)

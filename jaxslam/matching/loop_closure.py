@@ -15,13 +15,12 @@ References:
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import se2_np
-from jaxslam.core.batching import pad_to
+from jaxslam.core.batching import on_device, pad_to
 from jaxslam.core.scan import Lidar, Scan, check_lidar
-from jaxslam.core.types import AnyArray, Array, as_float64
+from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.matching import checks
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.registration import (
@@ -98,7 +97,7 @@ def find_loop_closures(
         some = slice(start, start + BATCH)
         submap_scans, later_scans = _take(scans, submap[some]), _take(scans, second[some])
         pairs = pad_to((submap_scans, submap_poses[some], guess[some], later_scans), to=BATCH)
-        batches.append(register_batch(spec, scan_matching, lidar, jax.tree.map(_on_device, pairs)))
+        batches.append(register_batch(spec, scan_matching, lidar, on_device(pairs)))
     if not batches:
         return LoopClosures(first, second, guess, np.zeros((0, 3, 3)))
     relative_pose, information, inliers, margin = (
@@ -112,11 +111,6 @@ def find_loop_closures(
 def _take(scans: Scan, index: np.ndarray) -> Scan:
     """Scans [...] at indices (...)."""
     return jax.tree.map(lambda x: x[index], scans)
-
-
-def _on_device(x: np.ndarray) -> Array:
-    """A JAX array, of JAX's default precision if its numbers are real."""
-    return jnp.asarray(x, float if x.dtype.kind == "f" else None)
 
 
 def _corrected(spec: LoopClosureSpec, information: np.ndarray) -> np.ndarray:

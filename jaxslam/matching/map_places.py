@@ -17,10 +17,10 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import trace_cache
+from jaxslam.core.batching import on_device
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2_np import compose, relative, transform
 from jaxslam.core.types import Array, as_float64
@@ -173,16 +173,11 @@ def _all_places(
         some = np.linspace(first, last - 1, spec.window_scans - 1).round().astype(int)
         window = np.append(some.clip(0, len(driven) - 1), keyframe)
         around = relative(own.poses[keyframe], own.poses[window])
-        scans = jax.tree.map(lambda x, window=window: _on_device(x[window]), own.scans)
-        found = _look_for(spec.place, own.lidar, index, scans, _on_device(around))
+        scans = on_device(jax.tree.map(lambda x, window=window: x[window], own.scans))
+        found = _look_for(spec.place, own.lidar, index, scans, on_device(around))
         poses.append(np.asarray(found[0], float))
         scores.append(np.asarray(found[1], float))
     return np.stack(poses), np.stack(scores)
-
-
-def _on_device(x: np.ndarray) -> Array:
-    """A JAX array, of JAX's default precision if its numbers are real."""
-    return jnp.asarray(x, float if x.dtype.kind == "f" else None)
 
 
 @partial(trace_cache.jit, static_argnames=("spec", "lidar"))

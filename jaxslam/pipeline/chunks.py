@@ -31,7 +31,7 @@ import numpy as np
 from jax import lax
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import pad_to
+from jaxslam.core.batching import on_device, pad_to
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement, ScanMatch
 from jaxslam.core.scan import Lidar, Scan
@@ -133,11 +133,7 @@ def chunk_at(first: int, odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray,
 
 def padded_chunk(odometry: np.ndarray, scans: Scan) -> tuple[Scan, Array, Array]:
     """Scans and odometry of a chunk, padded, in JAX's precision, and its length () int32."""
-
-    def as_jax(array: np.ndarray) -> Array:
-        return jnp.asarray(array, float if array.dtype.kind == "f" else None)
-
-    padded_scans, increments = jax.tree.map(as_jax, pad_to((scans, odometry), to=CHUNK))
+    padded_scans, increments = on_device(pad_to((scans, odometry), to=CHUNK))
     return padded_scans, increments, jnp.int32(len(odometry))
 
 

@@ -6,9 +6,9 @@ the old keyframes are a chain of poses that hardly bends, and loops are closed w
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.batching import on_device
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import increments
@@ -60,11 +60,7 @@ def resume(config: Config, saved: SavedMap) -> SlamState:
     Raises:
         ValueError: It has more landmarks than `config.filter.max_landmarks`.
     """
-
-    def as_jax(x: np.ndarray) -> jax.Array:
-        return jnp.asarray(x, float if x.dtype.kind == "f" else None)
-
-    belief, arcs = (jax.tree.map(as_jax, x) for x in (saved.belief, saved.arcs))
+    belief, arcs = on_device((saved.belief, saved.arcs))
     used, block = belief.num_seen.size, chunks.SLOT_BLOCK
     if used > config.filter.max_landmarks:
         raise ValueError(

@@ -24,7 +24,7 @@ from jaxslam.core.types import Array, Key
 from jaxslam.frontend.lidar import beam_angles
 from jaxslam.matching.place_index import PlaceIndex, PlaceSpec, build_index
 from jaxslam.matching.place_recognition import find_places, make_query
-from jaxslam.simulation import ray_casting
+from jaxslam.simulation import path_following, ray_casting
 from jaxslam.simulation.worlds import Box, World, outline
 
 LIDAR = Lidar(num_beams=181, angle_increment=np.pi / 180, range_max=15.0, range_std=0.01)
@@ -122,11 +122,7 @@ def _at_side(box: Box, side: int) -> Box:
 def make_plan(rng: np.random.Generator, num_rooms: int = 6) -> Plan:
     """A random plan with `num_rooms` offices on either side, and its drive."""
     walls, path = offices(rng, num_rooms)
-    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
-    driven = np.arange(0.0, along[-1] - 0.1, STEP)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = np.stack([np.interp(driven + 0.1, along, column) for column in path.T], axis=1)
-    poses = np.column_stack([x, y, np.arctan2(ahead[:, 1] - y, ahead[:, 0] - x)])
+    poses = path_following.poses_along(path, STEP, look_ahead=0.1)
     key = jax.random.key(int(rng.integers(2**31)))
     return Plan(walls, poses, scans_of(rng, key, walls, poses, Conditions()))
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.se2 import inverse_transform, range_bearing
-from jaxslam.core.types import Array, as_float64
+from jaxslam.core.types import AnyArray, Array, as_float64
 from jaxslam.simulation.robot import arc_increment
 
 SEARCH_WINDOW = 40  # points of the path ahead of the robot that are searched
@@ -36,6 +36,26 @@ def densify(waypoints: Any, spacing: float = 0.05) -> np.ndarray:
     wanted = np.linspace(0.0, at_waypoint[-1], round(at_waypoint[-1] / spacing) + 1)
     wanted = np.unique(np.concatenate([wanted, at_waypoint]))
     return np.stack([np.interp(wanted, at_waypoint, waypoints[:, k]) for k in range(2)], axis=1)
+
+
+def poses_along(path: AnyArray, spacing: float, look_ahead: float = 0.3) -> np.ndarray:
+    """Poses (T, 3) [m, m, rad] along a path (K, 2) [m], that look at it a little further on.
+
+    Args:
+        path: Points of the path, in the order of the drive.
+        spacing: [m] along it between two poses.
+        look_ahead: [m] from a pose to the point of the path that it looks at; the poses end as far
+            before the end.
+
+    Raises:
+        ValueError: The path has another shape.
+    """
+    path = as_float64("path", path, ("K", 2))
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    driven = np.arange(0.0, along[-1] - look_ahead, spacing)
+    x, y = (np.interp(driven, along, column) for column in path.T)
+    x_ahead, y_ahead = (np.interp(driven + look_ahead, along, column) for column in path.T)
+    return np.stack([x, y, np.arctan2(y_ahead - y, x_ahead - x)], axis=1)
 
 
 def pure_pursuit(

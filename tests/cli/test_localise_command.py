@@ -42,11 +42,7 @@ def write_log(path, poses):
 def poses():
     """Poses (T, 3) of a drive through the office."""
     path = path_following.densify(worlds.waypoints("office"))
-    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = 0.4 * np.arange(NUM_SCANS)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
-    return np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
+    return path_following.poses_along(path, 0.4)[:NUM_SCANS]
 
 
 @pytest.fixture

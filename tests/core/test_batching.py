@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core.batching import map_batches, pad_to, sequential_vmap_on_cpu, update_where
+from jaxslam.core.batching import (
+    map_batches,
+    on_device,
+    pad_to,
+    sequential_vmap_on_cpu,
+    update_where,
+)
 
 
 def assert_same(one, two):
@@ -120,3 +126,11 @@ def test_updates_that_are_not_wanted_are_not_computed():
         jax.block_until_ready(jax.vmap(one)(jnp.arange(9) < count, jnp.arange(9.0)))
         jax.effects_barrier()
         assert len(calls) == expected
+
+
+def test_arrays_on_the_device_have_its_precision_and_keep_their_kind():
+    given = {"real": np.ones(3, np.float32), "whole": np.arange(3, dtype=np.int32), "flag": [True]}
+    given["flag"] = np.array(given["flag"])
+    found = on_device(given)
+    assert found["real"].dtype == jnp.zeros(()).dtype and found["whole"].dtype == jnp.int32
+    assert found["flag"].dtype == jnp.bool_ and isinstance(found["whole"], jax.Array)

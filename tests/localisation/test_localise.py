@@ -31,11 +31,7 @@ def scans_of(lidar, poses, seed=0):
 def drive():
     """Poses (T, 3) of a drive through the office."""
     path = path_following.densify(worlds.waypoints("office"))
-    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = np.arange(0.0, along[-1] - 0.3, STEP)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
-    return np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
+    return path_following.poses_along(path, STEP)
 
 
 @pytest.fixture(scope="module")

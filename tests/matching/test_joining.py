@@ -22,11 +22,8 @@ FRAME = np.array([-31.0, 12.0, 2.2])
 def map_of(first, last, step=0.5):
     """The part of the drive through the office between two fractions of its length."""
     path = path_following.densify(worlds.waypoints("office"))
-    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = np.arange(first * along[-1], last * along[-1] - 0.3, step)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
-    poses = np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
+    poses = path_following.poses_along(path, step)
+    poses = poses[int(first * len(poses)) : int(last * len(poses))]
     scans = scans_of(worlds.named("office"), jnp.asarray(poses), LIDAR.range_std, int(100 * first))
     return ScanMap(LIDAR, poses, jax.tree.map(np.asarray, scans))
 

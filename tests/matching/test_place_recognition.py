@@ -22,11 +22,7 @@ HERE = jnp.zeros((1, 3))
 def drive(name, step=0.5):
     """Poses (T, 3) on the drive through a world, and its scans."""
     path = path_following.densify(worlds.waypoints(name))
-    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = np.arange(0.0, along[-1] - 0.3, step)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
-    poses = np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
+    poses = path_following.poses_along(path, step)
     return poses, scans_of(worlds.named(name), jnp.asarray(poses), LIDAR.range_std)
 
 

@@ -17,11 +17,7 @@ PARAMS = NoiseParams.for_laser_log(match_scans=True)
 def office_drive(step=0.25):
     """Poses (T, 3) on the drive through the office, and its scans."""
     path = path_following.densify(worlds.waypoints("office"))
-    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = np.arange(0.0, along[-1] - 0.3, step)
-    x, y = (np.interp(driven, along, column) for column in path.T)
-    ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
-    poses = np.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
+    poses = path_following.poses_along(path, step)
     world, keys = worlds.named("office"), jax.random.split(jax.random.key(3), len(poses))
 
     @jax.jit

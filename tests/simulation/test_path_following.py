@@ -6,7 +6,12 @@ from test_worlds import clearance, length
 
 from jaxslam.core.se2 import compose
 from jaxslam.simulation import worlds
-from jaxslam.simulation.path_following import SEARCH_WINDOW, densify, pure_pursuit
+from jaxslam.simulation.path_following import (
+    SEARCH_WINDOW,
+    densify,
+    poses_along,
+    pure_pursuit,
+)
 
 
 def driven(path, start, steps):
@@ -33,6 +38,17 @@ def test_densify_keeps_waypoints_and_spacing():
     np.testing.assert_allclose([points[0], points[-1]], [[0, 0], [1, 0.52]])
     assert np.any(np.all(np.isclose(points, [1, 0]), axis=1))
     assert gaps.max() < 0.06 and length(points) == pytest.approx(1.52)
+
+
+def test_poses_along_a_path_are_on_it_and_look_where_it_goes():
+    corner = [[0.0, 0.0], [2.0, 0.0], [2.0, 3.0]]
+    poses = poses_along(corner, 0.5)
+    assert len(poses) == 10  # up to 0.3 m before the end, 5 m along
+    np.testing.assert_allclose(poses[:4], [[0.5 * k, 0.0, 0.0] for k in range(4)], atol=1e-12)
+    np.testing.assert_allclose(poses[4:, 1], 0.5 * np.arange(6), atol=1e-12)
+    np.testing.assert_allclose(poses[4:, 2], np.pi / 2, atol=1e-12)
+    near = poses_along(corner, 1.9, look_ahead=0.2)[1]  # 0.1 m before the corner: 45 degrees
+    np.testing.assert_allclose(near, [1.9, 0.0, np.pi / 4], atol=1e-12)
 
 
 def test_the_office_drive_arrives_and_rests(office):

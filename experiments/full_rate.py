@@ -13,7 +13,6 @@ from experiments import common, log_folder
 from experiments.common import Numbers
 from experiments.log_folder import Log
 from jaxslam.evaluation import log_errors
-from jaxslam.evaluation.map_consistency import check_map
 from jaxslam.pipeline import log_input
 from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.online import SlamState
@@ -82,8 +81,7 @@ def own_rows(log: Log) -> Numbers:
             bar.update(int(np.asarray(part.keyframes)[-1]) + 1 - bar.n)
 
         result = log_input.run(given, callback=show)
-    lidar = given.config.frontend.lidar
-    found = check_map(lidar, result.poses, given.scans, piece=result.piece)
+    found = result.consistency
     estimates = {OWN: result.poses, DEAD_RECKONING: given.odom_poses}
     rows = []
     for method, poses in estimates.items():

@@ -18,8 +18,8 @@ from experiments.common import Numbers
 from experiments.damaged_drives import FINE, LOST, Damage, Drive
 from jaxslam.core.scan import Scan
 from jaxslam.core.time_series import match_times
-from jaxslam.evaluation.map_consistency import check_map
 from jaxslam.io import readers, tum
+from jaxslam.mapping.map_consistency import check_map
 
 NAME = "map_warnings"
 LOST_ERROR, FINE_ERROR = 0.5, 0.2  # [m] RMSE of the positions

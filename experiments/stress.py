@@ -26,7 +26,6 @@ from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.time_series import match_times
 from jaxslam.evaluation import log_errors
-from jaxslam.evaluation.map_consistency import check_map
 from jaxslam.io import readers
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import log_input
@@ -107,9 +106,7 @@ def run_log(log: LaserLog, source: OdometrySource) -> tuple[np.ndarray, bool, li
     """
     given = log_input.from_laser_log(log, source)
     result = log_input.run(given)
-    lidar = given.config.frontend.lidar
-    found = check_map(lidar, result.poses, given.scans, piece=result.piece)
-    warned = len(found.warnings) > 0 or len(result.other_parts) > 0
+    warned = len(result.consistency.warnings) > 0 or len(result.other_parts) > 0
     return result.poses, warned, [*given.notes, *result.notes]
 
 

@@ -18,8 +18,7 @@ from jaxslam.cli.run_evaluation import (
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.se2_np import compose, relative, trajectories_as_one
 from jaxslam.core.time_series import match_times
-from jaxslam.evaluation import log_errors, map_consistency
-from jaxslam.evaluation.map_consistency import MapConsistency
+from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
@@ -70,7 +69,7 @@ def write(
     """
     given = context.given
     config, scans = given.config, given.scans
-    consistency = _check_map(context, result)
+    consistency = result.consistency
     own = np.flatnonzero(np.isfinite(result.poses).all(axis=1))
     numbers: Metrics = extra | {
         "scans": len(own),
@@ -158,39 +157,6 @@ def write(
             np.concatenate(lines["odometry"])[at],
         )
     return numbers, len(consistency.warnings)
-
-
-def _check_map(context: RunContext, result: SlamResult) -> MapConsistency:
-    """Whether the scans agree with the map, and with the saved one that it goes on in."""
-    lidar, scans, saved = (
-        context.given.config.frontend.lidar,
-        context.given.scans,
-        result.saved_poses,
-    )
-    if saved is None or context.saved_map is None:
-        return map_consistency.check_map(lidar, result.poses, scans, piece=result.piece)
-    count = len(saved)
-    both = jax.tree.map(lambda *x: np.concatenate(x), context.saved_map.scans, scans)
-    piece = np.concatenate([np.full(count, -2), result.piece])  # -1 are scans without a pose
-    found = map_consistency.check_map(
-        lidar, np.concatenate([saved, result.poses]), both, piece=piece
-    )
-    new = found.scan >= count
-    warnings = tuple(
-        warning._replace(
-            first_scan=max(warning.first_scan - count, 0), last_scan=warning.last_scan - count
-        )
-        for warning in found.warnings
-        if warning.last_scan >= count
-    )
-    return found._replace(
-        scan=found.scan[new] - count,
-        poses=found.poses[new],
-        step_contradiction=found.step_contradiction[new[1:]][1:],
-        step_confirmation=found.step_confirmation[new[1:]][1:],
-        visit_contradiction=found.visit_contradiction[new],
-        warnings=warnings,
-    )
 
 
 def _from_first(measurements: Measurement) -> Measurement:

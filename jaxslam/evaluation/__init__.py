@@ -9,12 +9,12 @@ from jaxslam.evaluation.log_errors import Trajectory as Trajectory
 from jaxslam.evaluation.log_errors import errors_against as errors_against
 from jaxslam.evaluation.log_errors import mean_ate as mean_ate
 from jaxslam.evaluation.log_errors import mean_nees_per_dof as mean_nees_per_dof
-from jaxslam.evaluation.map_consistency import MapConsistency as MapConsistency
-from jaxslam.evaluation.map_consistency import check_map as check_map
-from jaxslam.evaluation.map_warnings import MapWarning as MapWarning
 from jaxslam.evaluation.summary import Metrics as Metrics
 from jaxslam.evaluation.summary import evaluate as evaluate
 from jaxslam.evaluation.trajectory import align_trajectory as align_trajectory
 from jaxslam.evaluation.trajectory import ate as ate
 from jaxslam.evaluation.trajectory import relation_errors as relation_errors
 from jaxslam.evaluation.trajectory import rpe as rpe
+from jaxslam.mapping.map_consistency import MapConsistency as MapConsistency
+from jaxslam.mapping.map_consistency import check_map as check_map
+from jaxslam.mapping.map_warnings import MapWarning as MapWarning

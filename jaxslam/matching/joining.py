@@ -92,7 +92,7 @@ def find_join(spec: JoinSpec, first: ScanMap, second: ScanMap) -> Join:
     if not sets:
         return Join(np.zeros(3), False, 0, 0.0, 1.0, 1.0)
     joins, values = [], []
-    posed_first, posed_second = _posed(first), _posed(second)
+    posed_first, posed_second = posed_scans_of(first), posed_scans_of(second)
     for members in sets:
         agreeing = FoundPlaces(*(x[members] for x in found))
         between = fit_transform(agreeing.second, agreeing.first, agreeing.weight)
@@ -133,7 +133,7 @@ def check_join(spec: JoinSpec, first: ScanMap, second: ScanMap, between: np.ndar
         second: Another one, by the same scanner.
         between: (3,) [m, m, rad] frame of the second map, in that of the first.
     """
-    confirmed, contradicted = compare_maps(_posed(first), _posed(second), between)
+    confirmed, contradicted = compare_maps(posed_scans_of(first), posed_scans_of(second), between)
     share = contradicted / max(confirmed + contradicted, 1.0)
     accepted = confirmed > 0.0 and share <= spec.max_contradiction
     return Join(between, accepted, 0, 0.0, share, 0.0)
@@ -169,7 +169,7 @@ def compare_maps(first: PosedScans, second: PosedScans, between: np.ndarray) -> 
     return float(agreement.num_ends(CONFIRMED).sum()), float(agreement.num_ends(CONTRADICTED).sum())
 
 
-def _posed(scan_map: ScanMap) -> PosedScans:
+def posed_scans_of(scan_map: ScanMap) -> PosedScans:
     """The scans of a map that are compared."""
     lidar, poses, scans = scan_map
     return posed_scans(lidar, poses, np.asarray(scans.ranges, float), np.asarray(scans.hit))

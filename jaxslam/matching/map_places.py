@@ -136,9 +136,9 @@ def places_between(spec: JoinSpec, first: ScanMap, second: ScanMap) -> FoundPlac
     """All places of either map that are found in the other."""
     parts, num_queries = [], 0
     for swapped, (own, other) in enumerate(((second, first), (first, second))):
-        keyframes = _query_keyframes(spec, own.poses)
+        keyframes = query_keyframes(spec, own.poses)
         index = build_index(spec.place, other.lidar, other.poses, other.scans)
-        poses, scores = _all_places(spec, index, own, keyframes)
+        poses, scores = all_places(spec, index, own, keyframes)
         number, candidate = np.nonzero(scores > MIN_PLACE_SCORE)
         found, keyframe = poses[number, candidate], keyframes[number]
         ends = found, own.poses[keyframe]
@@ -149,23 +149,23 @@ def places_between(spec: JoinSpec, first: ScanMap, second: ScanMap) -> FoundPlac
     return FoundPlaces(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _query_keyframes(spec: JoinSpec, poses: np.ndarray) -> np.ndarray:
+def query_keyframes(spec: JoinSpec, poses: np.ndarray) -> np.ndarray:
     """Keyframes (Q,) int that are looked for, evenly spaced along the drive."""
-    driven = _driven(poses)
+    driven = distance_driven(poses)
     spacing = max(spec.query_spacing, driven[-1] / spec.max_queries)
     return np.unique(np.floor(driven / spacing), return_index=True)[1]
 
 
-def _driven(poses: np.ndarray) -> np.ndarray:
+def distance_driven(poses: np.ndarray) -> np.ndarray:
     """(K,) [m] driven up to each pose."""
     return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
-def _all_places(
+def all_places(
     spec: JoinSpec, index: PlaceIndex, own: ScanMap, keyframes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (Q, C, 3) and scores (Q, C) of the places of keyframes (Q,) in another map."""
-    driven, poses, scores = _driven(own.poses), [], []
+    driven, poses, scores = distance_driven(own.poses), [], []
     for keyframe in keyframes.tolist():
         first, last = np.searchsorted(
             driven, driven[keyframe] + spec.window * np.array([-1.0, 1.0]), side="right"

@@ -44,6 +44,11 @@ class PosedScans(NamedTuple):
     ranges: np.ndarray
     ends: np.ndarray
 
+    def only(self, kept: np.ndarray) -> Self:
+        """The scans (K,) that are True."""
+        rows = {name: getattr(self, name)[kept] for name in self._fields if name != "angles"}
+        return self._replace(**rows)
+
 
 class Agreement(NamedTuple):
     """P pairs of scans compared: Q ends of either's beams, in the view of the other scan.

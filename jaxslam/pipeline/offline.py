@@ -1,36 +1,30 @@
 """SLAM on a whole log: chunks of keyframes, then batch smoothing with loop closures."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 
-from jaxslam.core.measurement import Measurement
-from jaxslam.core.scan import Scan
-from jaxslam.core.se2_np import compose, relative, trajectories_as_one
+from jaxslam.core.se2_np import compose, relative
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.mapping.saved_map import SavedMap
-from jaxslam.matching.map_places import ScanMap
 from jaxslam.pipeline import (
     arguments,
     keyframes,
     odometry_notes,
     online,
     pieces,
+    reclosing,
     sessions,
     stages,
 )
-from jaxslam.pipeline.chunks import ChunkResult
 from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.filtered import Callback, Filtered, Run, filter_chunks, result_of, scan_map
 from jaxslam.pipeline.online import SlamState
 from jaxslam.pipeline.pieces import Group
-from jaxslam.pipeline.results import SlamResult, piece_of, spread
-from jaxslam.pipeline.smoothing_stage import smooth_result
+from jaxslam.pipeline.results import SlamResult
 from jaxslam.pipeline.stages import Drive, KeyframeChunk
-
-Callback = Callable[[SlamState, ChunkResult], Any]
 
 
 def run_slam(
@@ -59,6 +53,9 @@ def run_slam(
     landmarks are estimated from all measurements (`sparse.smooth_log`), and where scans are
     matched, loops are closed by matching scans of later visits with those of earlier ones
     (`loop_closure.find_loop_closures`).
+
+    Where the map contradicts itself, the drive is closed at places that are found again, metres from
+    where it has them (`reclosing`), if that makes it better; a note says so.
 
     Where the robot was moved from one scan to the next (`breaks`), the pieces of the drive are
     mapped on their own, and joined where places are found again (`pieces`). The result is the
@@ -117,7 +114,7 @@ def run_slam(
         increments = np.zeros_like(increments)
     distance = keyframes.distance_for_log(config.keyframe_distance, increments)
     config = config._replace(keyframe_distance=distance)
-    run = _Run(config, params, scans, match_scans, smooth, callback)
+    run = Run(config, params, scans, match_scans, smooth, callback)
     state = online.init(config, pose, match_scans=match_scans)
     drive = Drive(increments, scans, guessed, after_pause, new_drive)
     log = stages.keyframe_chunks(config, state.submap, drive)
@@ -126,7 +123,7 @@ def run_slam(
     if later or saved_map is not None:
         results = _several_pieces(run, first, later, saved_map)
     else:
-        results = [_result(run, first)]
+        results = [reclosing.close_again(run, first, result_of(run, first))[1]]
     results.sort(key=_importance)
     main, *others = results
     if saved_map is not None and main.saved_poses is None:
@@ -151,68 +148,36 @@ def _importance(result: SlamResult) -> tuple[bool, int]:
     return result.saved_poses is None, -int(np.count_nonzero(result.piece >= 0))
 
 
-class _Run(NamedTuple):
-    """What all stages of a run need: arguments of `run_slam`, checked."""
-
-    config: Config
-    params: NoiseParams
-    scans: Scan
-    match_scans: bool
-    smooth: bool
-    callback: Callback | None
-
-
-class _Filtered(NamedTuple):
-    """Keyframes that the filter was given: its start, its state after them, and its results."""
-
-    start: Any
-    state: SlamState
-    saved: SavedMap | None = None
-    chunks: tuple[KeyframeChunk, ...] = ()
-    results: tuple[ChunkResult, ...] = ()
-
-
 def _first_piece(
-    run: _Run, state: SlamState, start: Any, log: Iterable[KeyframeChunk]
-) -> tuple[_Filtered, list[KeyframeChunk]]:
+    run: Run, state: SlamState, start: Any, log: Iterable[KeyframeChunk]
+) -> tuple[Filtered, list[KeyframeChunk]]:
     """Filter the first piece of a log while its next scans are matched; and the chunks after it."""
-    filtered, chunks = _Filtered(start, state), iter(log)
+    filtered, chunks = Filtered(start, state), iter(log)
     following = next(chunks, None)
     while following is not None and following.piece == 0:
         now, following = following, next(chunks, None)  # in the background of the filter
-        filtered = _filter(run, filtered, [now])
+        filtered = filter_chunks(run, filtered, [now])
     return filtered, [] if following is None else [following, *chunks]
 
 
-def _filter(run: _Run, filtered: _Filtered, chunks: Sequence[KeyframeChunk]) -> _Filtered:
-    """Give chunks of keyframes to the filter."""
-    for now in chunks:
-        state, result = online.advance(run.config, run.params, filtered.state, now.chunk)
-        result = result._replace(keyframes=now.keyframes)
-        if run.callback is not None:
-            run.callback(state, result)
-        filtered = filtered._replace(
-            state=state, chunks=(*filtered.chunks, now), results=(*filtered.results, result)
-        )
-    return filtered
-
-
 def _several_pieces(
-    run: _Run, first: _Filtered, later: Sequence[KeyframeChunk], saved: SavedMap | None
+    run: Run, first: Filtered, later: Sequence[KeyframeChunk], saved: SavedMap | None
 ) -> list[SlamResult]:
     """Results of the groups of pieces, and perhaps of a saved map, that can be joined."""
     quiet, alone = run._replace(callback=None), {0: first}
     for chunk in later:
         if chunk.piece not in alone:
             start = arguments.as_start(None)
-            alone[chunk.piece] = _Filtered(start, online.init(run.config, start))
-        alone[chunk.piece] = _filter(quiet, alone[chunk.piece], [chunk])
-    found = {number: _result(run, piece) for number, piece in alone.items()}
-    maps = {number: _scan_map(run, one) for number, one in found.items()}
+            alone[chunk.piece] = Filtered(start, online.init(run.config, start))
+        alone[chunk.piece] = filter_chunks(quiet, alone[chunk.piece], [chunk])
+    found = {}
+    for number, piece in alone.items():
+        alone[number], found[number] = reclosing.close_again(quiet, piece, result_of(run, piece))
+    maps = {number: scan_map(run, one) for number, one in found.items()}
     if saved is not None:
         maps[pieces.SAVED] = sessions.scan_map(saved)
         start = arguments.as_start(saved.poses[0])
-        alone[pieces.SAVED] = _Filtered(start, sessions.resume(run.config, saved), saved)
+        alone[pieces.SAVED] = Filtered(start, sessions.resume(run.config, saved), saved)
     results = []
     firsts = {number: piece.chunks[0] for number, piece in alone.items() if piece.chunks}
     across = {k: x.across_break for k, x in firsts.items() if x.across_break is not None}
@@ -224,20 +189,19 @@ def _several_pieces(
             for before, after, number in zip(own, own[1:], left, strict=False):
                 chunks = alone[number].chunks
                 gap = relative(before[-1], after[0])
-                filtered = _filter(run, filtered, [pieces.after_gap(chunks[0], gap), *chunks[1:]])
-            results.append(_result(run, filtered, np.concatenate(own), _notes(group, alone)))
+                filtered = filter_chunks(
+                    run,
+                    filtered,
+                    [pieces.after_gap(chunks[0], np.array([0]), gap[None]), *chunks[1:]],
+                )
+            result = result_of(run, filtered, np.concatenate(own), _notes(group, alone))
+            results.append(reclosing.close_again(quiet, filtered, result)[1])
         elif number != pieces.SAVED:
             results.append(found[number])
     return results
 
 
-def _scan_map(run: _Run, result: SlamResult) -> ScanMap:
-    """The keyframes of a result."""
-    scans = jax.tree.map(lambda x: x[result.keyframes], run.scans)
-    return ScanMap(run.config.frontend.lidar, result.poses[result.keyframes], scans)
-
-
-def _notes(group: Group, alone: Mapping[int, _Filtered]) -> tuple[str, ...]:
+def _notes(group: Group, alone: Mapping[int, Filtered]) -> tuple[str, ...]:
     """A note of what the pieces of a group are, and of how they were joined."""
     names = []
     for number in group.pieces:
@@ -249,72 +213,3 @@ def _notes(group: Group, alone: Mapping[int, _Filtered]) -> tuple[str, ...]:
     if len(places) < len(group.joins):
         how.append("as scan matching has it across a break")
     return (f"{' and '.join(names)} were mapped alone, and joined {', or '.join(how)}",)
-
-
-def _result(
-    run: _Run,
-    filtered: _Filtered,
-    guess: np.ndarray | None = None,
-    notes: tuple[str, ...] = (),
-) -> SlamResult:
-    """The result of keyframes that were filtered, smoothed if that is asked for."""
-    state, config = filtered.state, run.config
-    info, features, matches, numbers = stages.concatenate(list(filtered.results))
-    keyframe_odometry = np.concatenate([chunk.odometry for chunk in filtered.chunks])
-    matched = stages.concatenate([chunk.matched for chunk in filtered.chunks])
-    motion = keyframes.motion_since_keyframe(matched.increments, matched.is_keyframe)
-    keyframe_poses, closures = np.asarray(info.pose, np.float64), None
-    online_poses = keyframes.poses_since_keyframes(keyframe_poses, matched.is_keyframe, motion)
-    poses = online_poses
-    saved_poses = None if filtered.saved is None else filtered.saved.poses
-    if run.smooth:
-        own: Any = keyframe_odometry.astype(info.pose.dtype)  # NumPy, like the rest
-        measurements, diagnostics = Measurement(own, features, scan_match=matches), info
-        scans = jax.tree.map(lambda x: x[numbers], run.scans) if run.match_scans else None
-        if filtered.saved is not None and scans is not None:
-            measurements, diagnostics, scans = sessions.with_saved_keyframes(
-                filtered.saved, measurements, info, scans
-            )
-        smoothed, belief, closures = smooth_result(
-            config,
-            run.params,
-            filtered.start,
-            measurements,
-            diagnostics,
-            state.belief,
-            scans,
-            guess,
-        )
-        state = state._replace(belief=belief)
-        num_saved = len(smoothed) - len(keyframe_poses)
-        keyframe_poses = smoothed[num_saved:]
-        if num_saved:
-            saved_poses, closures = smoothed[:num_saved], sessions.of_new(closures, num_saved)
-        poses = keyframes.interpolate_poses(
-            keyframe_poses, matched.is_keyframe, motion, matched.increments
-        )
-    piece = piece_of(filtered.chunks, len(run.scans.hit))
-    drives = np.split(keyframe_poses, np.flatnonzero(np.diff(piece[numbers])) + 1)
-    if saved_poses is not None:
-        drives.insert(0, saved_poses)
-    topological_map = online.topological_map(config, state, trajectories_as_one(drives))
-    if matched.matches is not None and config.scan_matching.use_odometry:
-        notes += odometry_notes.contradictions(matched.matches)
-        notes += odometry_notes.unsigned(matched.matches, matched.odometry)
-        notes += odometry_notes.wrong_scale(matched.matches, matched.odometry)
-    return SlamResult(
-        spread(poses, piece >= 0),
-        spread(online_poses, piece >= 0),
-        numbers,
-        state.belief,
-        info,
-        features,
-        topological_map,
-        matches,
-        closures,
-        keyframe_odometry,
-        notes,
-        state.arcs,
-        piece,
-        saved_poses,
-    )

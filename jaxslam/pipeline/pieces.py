@@ -136,24 +136,25 @@ def _merged(one: Group, other: Group, join: Join) -> Group:
     return Group(frames, (*one.joins, *other.joins, join))
 
 
-def after_gap(chunk: KeyframeChunk, increment: np.ndarray) -> KeyframeChunk:
-    """The first chunk of a piece, its first step the motion from the last keyframe before it.
+def after_gap(chunk: KeyframeChunk, rows: np.ndarray, increments: np.ndarray) -> KeyframeChunk:
+    """A chunk where the motion to some keyframes is not as matched, but known otherwise.
 
     Args:
         chunk: The chunk.
-        increment: (3,) [m, m, rad] as the join has it.
+        rows: (N,) int indices of these keyframes in the chunk.
+        increments: (N, 3) [m, m, rad] motion to them from the keyframe before, of `JOIN_STD`.
     """
     measurements = chunk.chunk.measurements
     match = measurements.scan_match
     assert match is not None and match.expected is not None and match.expected_variance is not None
 
     def put(held: Any, value: Any) -> Any:
-        return held.at[0].set(jnp.asarray(value, held.dtype))
+        return held.at[rows].set(jnp.asarray(value, held.dtype))
 
     match = match._replace(
         information=put(match.information, np.zeros((3, 3))),
-        increment=put(match.increment, increment),
-        expected=put(match.expected, increment),
+        increment=put(match.increment, increments),
+        expected=put(match.expected, increments),
         expected_variance=put(match.expected_variance, np.square(JOIN_STD)),
     )
     measurements = measurements._replace(scan_match=match)

@@ -11,6 +11,7 @@ from jaxslam.core.measurement import ScanMatch
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.mapping.arc_table import ArcTable
+from jaxslam.mapping.map_consistency import MapConsistency
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.pipeline.stages import KeyframeChunk
 
@@ -31,6 +32,7 @@ class SlamResult(NamedTuple):
         info: [K] diagnostics of the filter, with its estimates at the time.
         features: [K] features.
         topological_map: Topological map.
+        consistency: Whether the scans agree with the map; its `warnings` say where they do not.
         scan_matches: [K] increments by scan matching since the keyframe before, where scans were
             matched.
         loop_closures: Loop closures that the trajectory was smoothed with, where there were any;
@@ -54,6 +56,7 @@ class SlamResult(NamedTuple):
     info: StepInfo
     features: Features
     topological_map: TopologicalMap
+    consistency: MapConsistency
     scan_matches: ScanMatch | None = None
     loop_closures: LoopClosures | None = None
     odometry: np.ndarray | None = None

@@ -30,7 +30,7 @@ def evaluated(piece, **given):
     poses = np.where(piece[:, None] >= 0, TRUTH, np.nan)
     own = np.flatnonzero(piece >= 0)
     info = SimpleNamespace(pose_cov=np.tile(0.01 * np.eye(3), (len(own), 1, 1)))
-    rest = dict.fromkeys(("belief", "features", "topological_map"))
+    rest = dict.fromkeys(("belief", "features", "topological_map", "consistency"))
     result = SlamResult(poses, poses, own, info=info, piece=piece, **rest)
     drive = drive_of(**given)
     run = SimpleNamespace(odom_poses=drive.log.odom_poses)

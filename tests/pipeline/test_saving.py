@@ -39,6 +39,7 @@ def result(**changes):
         info=SimpleNamespace(pose_cov=np.full((K, 3, 3), 0.25)),
         features=None,
         topological_map=graph,
+        consistency=None,
         arcs=empty_arcs(capacity=8),
     )
     return made._replace(**changes)

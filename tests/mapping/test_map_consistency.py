@@ -3,7 +3,7 @@ import pytest
 
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import compose, dead_reckoning, increments, transform
-from jaxslam.evaluation.map_consistency import check_map
+from jaxslam.mapping.map_consistency import check_map
 from jaxslam.matching.scan_agreement import (
     CONFIRMED,
     CONTRADICTED,

@@ -1,6 +1,6 @@
 """Whether the scans of a run agree with the map that all others make: it knows when it is lost."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2_np import wrap_angle
 from jaxslam.core.types import as_float64, check_array
-from jaxslam.evaluation import map_warnings
-from jaxslam.evaluation.map_warnings import USUAL_CONTRADICTION, VISIT_SEPARATION, MapWarning
-from jaxslam.evaluation.summary import Metrics
+from jaxslam.mapping import map_warnings
+from jaxslam.mapping.map_warnings import USUAL_CONTRADICTION, VISIT_SEPARATION, MapWarning
 from jaxslam.matching.scan_agreement import (
     CONFIRMED,
     CONTRADICTED,
@@ -63,7 +62,7 @@ class MapConsistency(NamedTuple):
         worst = np.maximum(worst, np.nan_to_num(self.visit_contradiction))
         return worst <= USUAL_CONTRADICTION
 
-    def metrics(self) -> Metrics:
+    def metrics(self) -> dict[str, Any]:
         """The content of the key `map_consistency` of `metrics.json`."""
         median, p90 = None, None
         if self.wall_distance.size:

@@ -1,0 +1,139 @@
+"""Keyframes given to the filter, and what becomes of them: trajectory, landmarks, map."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxslam.core.measurement import Measurement
+from jaxslam.core.scan import Scan
+from jaxslam.core.se2_np import trajectories_as_one
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.mapping.saved_map import SavedMap
+from jaxslam.matching.map_places import ScanMap
+from jaxslam.pipeline import keyframes, odometry_notes, online, self_check, sessions, stages
+from jaxslam.pipeline.chunks import ChunkResult
+from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.online import SlamState
+from jaxslam.pipeline.results import SlamResult, piece_of, spread
+from jaxslam.pipeline.smoothing_stage import smooth_result
+from jaxslam.pipeline.stages import KeyframeChunk
+
+Callback = Callable[[SlamState, ChunkResult], Any]
+
+
+class Run(NamedTuple):
+    """What all stages of a run need: arguments of `run_slam`, checked."""
+
+    config: Config
+    params: NoiseParams
+    scans: Scan
+    match_scans: bool
+    smooth: bool
+    callback: Callback | None
+
+
+class Filtered(NamedTuple):
+    """Keyframes that the filter was given: its start, its state after them, and its results."""
+
+    start: Any
+    state: SlamState
+    saved: SavedMap | None = None
+    chunks: tuple[KeyframeChunk, ...] = ()
+    results: tuple[ChunkResult, ...] = ()
+
+
+def filter_chunks(run: Run, filtered: Filtered, chunks: Sequence[KeyframeChunk]) -> Filtered:
+    """Give chunks of keyframes to the filter."""
+    for now in chunks:
+        state, result = online.advance(run.config, run.params, filtered.state, now.chunk)
+        result = result._replace(keyframes=now.keyframes)
+        if run.callback is not None:
+            run.callback(state, result)
+        filtered = filtered._replace(
+            state=state, chunks=(*filtered.chunks, now), results=(*filtered.results, result)
+        )
+    return filtered
+
+
+def scan_map(run: Run, result: SlamResult) -> ScanMap:
+    """The keyframes of a result."""
+    scans = jax.tree.map(lambda x: x[result.keyframes], run.scans)
+    return ScanMap(run.config.frontend.lidar, result.poses[result.keyframes], scans)
+
+
+def result_of(
+    run: Run,
+    filtered: Filtered,
+    guess: np.ndarray | None = None,
+    notes: tuple[str, ...] = (),
+) -> SlamResult:
+    """The result of keyframes that were filtered, smoothed if that is asked for."""
+    state, config = filtered.state, run.config
+    info, features, matches, numbers = stages.concatenate(list(filtered.results))
+    keyframe_odometry = np.concatenate([chunk.odometry for chunk in filtered.chunks])
+    matched = stages.concatenate([chunk.matched for chunk in filtered.chunks])
+    motion = keyframes.motion_since_keyframe(matched.increments, matched.is_keyframe)
+    keyframe_poses, closures = np.asarray(info.pose, np.float64), None
+    online_poses = keyframes.poses_since_keyframes(keyframe_poses, matched.is_keyframe, motion)
+    poses = online_poses
+    saved_poses = None if filtered.saved is None else filtered.saved.poses
+    if run.smooth:
+        own: Any = keyframe_odometry.astype(info.pose.dtype)  # NumPy, like the rest
+        measurements, diagnostics = Measurement(own, features, scan_match=matches), info
+        scans = jax.tree.map(lambda x: x[numbers], run.scans) if run.match_scans else None
+        if filtered.saved is not None and scans is not None:
+            measurements, diagnostics, scans = sessions.with_saved_keyframes(
+                filtered.saved, measurements, info, scans
+            )
+        smoothed, belief, closures = smooth_result(
+            config,
+            run.params,
+            filtered.start,
+            measurements,
+            diagnostics,
+            state.belief,
+            scans,
+            guess,
+        )
+        state = state._replace(belief=belief)
+        num_saved = len(smoothed) - len(keyframe_poses)
+        keyframe_poses = smoothed[num_saved:]
+        if num_saved:
+            saved_poses, closures = smoothed[:num_saved], sessions.of_new(closures, num_saved)
+        poses = keyframes.interpolate_poses(
+            keyframe_poses, matched.is_keyframe, motion, matched.increments
+        )
+    piece = piece_of(filtered.chunks, len(run.scans.hit))
+    drives = np.split(keyframe_poses, np.flatnonzero(np.diff(piece[numbers])) + 1)
+    if saved_poses is not None:
+        drives.insert(0, saved_poses)
+    topological_map = online.topological_map(config, state, trajectories_as_one(drives))
+    if matched.matches is not None and config.scan_matching.use_odometry:
+        notes += odometry_notes.contradictions(matched.matches)
+        notes += odometry_notes.unsigned(matched.matches, matched.odometry)
+        notes += odometry_notes.wrong_scale(matched.matches, matched.odometry)
+    all_poses = spread(poses, piece >= 0)
+    saved = None
+    if filtered.saved is not None and saved_poses is not None:
+        saved = filtered.saved, saved_poses
+    lidar = config.frontend.lidar
+    consistency = self_check.check_poses(lidar, all_poses, run.scans, piece, saved)
+    return SlamResult(
+        all_poses,
+        spread(online_poses, piece >= 0),
+        numbers,
+        state.belief,
+        info,
+        features,
+        topological_map,
+        consistency,
+        matches,
+        closures,
+        keyframe_odometry,
+        notes,
+        state.arcs,
+        piece,
+        saved_poses,
+    )

@@ -1,0 +1,236 @@
+"""A drive whose map contradicts itself, closed where it shows places twice.
+
+Where scans contradict it, the heading was lost, or wheels and scans were both wrong, somewhere
+before. From places that are found again, far from where the drive had them (`revisits`), follow
+poses of the whole drive (`rotation_first`), and at which steps the motion cannot have been as
+matched:
+
+        o---o---o---o             o---o---o---o
+        |           |             |           |
+        o           o      ->     o           o      the places x are one: that step was longer
+        |           |             |           |
+        x     x-o---o             x ~ ~ ~ o---o
+
+The filter is run again along these poses, so that it associates landmarks across the loops, and all
+is smoothed again, with the measurements as they were except for these steps. What has come out is
+taken only if it contradicts itself less.
+"""
+
+from functools import partial
+
+import jax
+import numpy as np
+
+from jaxslam.core import trace_cache
+from jaxslam.core.batching import on_device
+from jaxslam.core.measurement import Measurement, ScanMatch
+from jaxslam.core.scan import Scan
+from jaxslam.core.se2_np import increments, wrap_angle
+from jaxslam.core.types import Array
+from jaxslam.filtering.noise import NoiseParams, motion_estimate
+from jaxslam.mapping.map_consistency import MapConsistency
+from jaxslam.matching.map_places import ScanMap
+from jaxslam.matching.revisits import Revisits, find_revisits
+from jaxslam.pipeline import online, pieces, sessions
+from jaxslam.pipeline.filtered import Filtered, Run, filter_chunks, result_of
+from jaxslam.pipeline.results import SlamResult
+from jaxslam.pipeline.stages import KeyframeChunk
+from jaxslam.smoothing.problem import ODOMETRY_STD_FLOOR
+from jaxslam.smoothing.rotation_first import Factors, solve_rotation_first
+
+MAX_ROUNDS = 3
+"""Times that places are looked for, each in the map made before."""
+
+REVISIT_STD = (0.1, 0.1, 0.02)
+"""[m], [m], [rad] std of a place that was found again."""
+
+CLOSURE_STD = 1.0
+"""[m], [rad] std of what a loop closure does not constrain."""
+
+WRONG_STEP = 5.0
+"""[std] of a step, beyond which it was not as matched."""
+
+LEAST_TRUST = 0.1
+"""Inlier fraction, times weight of the wheels, of a step that is contradicted most."""
+
+UNEXPLAINED = 0.01
+"""Share of the scans that may contradict a map, without a warning, before places are looked for."""
+
+LESS = 0.8
+"""Factor by which the scans that contradict the map have to become fewer, at least."""
+
+
+def close_again(run: Run, filtered: Filtered, result: SlamResult) -> tuple[Filtered, SlamResult]:
+    """The result, if its map contradicts itself closed at places that were found again.
+
+    Args:
+        run: What all stages need.
+        filtered: The keyframes that the filter was given.
+        result: What came out.
+
+    Returns:
+        Both, as they were or closed.
+    """
+    if not (run.match_scans and run.smooth):
+        return filtered, result
+    for _ in range(MAX_ROUNDS):
+        before = result.consistency
+        if not before.warnings and np.mean(~before.explained) <= UNEXPLAINED:
+            break
+        poses, scans, measurements = _whole_drive(run, filtered, result)
+        found = find_revisits(run.config.joining, ScanMap(run.config.frontend.lidar, poses, scans))
+        if not len(found.first):
+            break
+        poses, wrong = _solve(run, result, poses, measurements, found)
+        again = _filter_again(run, filtered, result, poses, wrong)
+        notes = (*result.notes, *_notes(result, poses, found))
+        closed = result_of(run, again, poses, notes)
+        if not _is_better(closed.consistency, before):
+            break
+        filtered, result = again, closed
+    return filtered, result
+
+
+def _is_better(new: MapConsistency, old: MapConsistency) -> bool:
+    """Whether a map contradicts itself clearly less than another one of the same scans."""
+    unexplained = [float(np.mean(~x.explained)) for x in (new, old)]
+    return len(new.warnings) <= len(old.warnings) and unexplained[0] < LESS * unexplained[1]
+
+
+def _whole_drive(
+    run: Run, filtered: Filtered, result: SlamResult
+) -> tuple[np.ndarray, Scan, Measurement]:
+    """Poses (K, 3), scans [K] and measurements [K] of all keyframes, those of a saved map first."""
+    scans = jax.tree.map(lambda x: x[result.keyframes], run.scans)
+    poses = result.poses[result.keyframes]
+    assert result.odometry is not None
+    odometry = result.odometry.astype(np.asarray(result.info.pose).dtype)
+    measurements = Measurement(odometry, result.features, scan_match=result.scan_matches)  # type: ignore[arg-type]
+    if filtered.saved is not None and result.saved_poses is not None:
+        measurements, _, scans = sessions.with_saved_keyframes(
+            filtered.saved, measurements, result.info, scans
+        )
+        poses = np.concatenate([result.saved_poses, poses])
+    return poses, scans, measurements
+
+
+def _solve(
+    run: Run, result: SlamResult, poses: np.ndarray, measurements: Measurement, found: Revisits
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (K, 3) by motion, loop closures, and places found again; and wrong steps (K,)."""
+    motion = _motion(run.params, on_device(measurements))
+    increment, matched_cov = (np.asarray(x, float) for x in motion)
+    matched_cov = matched_cov + ODOMETRY_STD_FLOOR**2 * np.eye(3)
+    cov = matched_cov * _uncertainty(measurements)[:, None, None] ** 2
+    count, num_saved = len(poses), len(poses) - len(result.keyframes)
+    steps, places = np.arange(1, count), len(found.first)
+    parts = [
+        Factors(
+            first=steps - 1,
+            second=steps,
+            relative_pose=increment[1:],
+            cov=cov[1:],
+        ),
+        Factors(
+            first=found.first,
+            second=found.second,
+            relative_pose=found.relative_pose,
+            cov=np.broadcast_to(np.diag(np.square(REVISIT_STD)), (places, 3, 3)),
+        ),
+    ]
+    closures = result.loop_closures
+    if closures is not None:
+        information = closures.information + np.eye(3) / CLOSURE_STD**2
+        parts.append(
+            Factors(
+                first=closures.first + num_saved,
+                second=closures.second + num_saved,
+                relative_pose=closures.relative_pose,
+                cov=np.linalg.inv(information),
+            )
+        )
+    factors = Factors(*map(np.concatenate, zip(*parts, strict=True)))
+    poses = solve_rotation_first(poses, factors).poses
+    off = increments(poses) - increment
+    off[:, 2] = wrap_angle(off[:, 2])
+    square = np.sum(off * np.linalg.solve(matched_cov, off[..., None])[..., 0], axis=1)
+    return poses, (square > WRONG_STEP**2) & (np.arange(count) > 0)
+
+
+def _uncertainty(measurements: Measurement) -> np.ndarray:
+    """Factor (K,) on the std of a step, which is large where scans or wheels contradict it."""
+    match = measurements.scan_match
+    assert match is not None
+    trust = np.asarray(match.inlier_fraction, float)
+    if match.odometry_weight is not None:
+        trust = trust * np.asarray(match.odometry_weight)
+    matched = np.asarray(match.information).any(axis=(1, 2))
+    return np.where(matched, 1.0 / trust.clip(LEAST_TRUST, 1.0), 1.0)
+
+
+@partial(trace_cache.jit)
+def _motion(params: NoiseParams, measurements: Measurement) -> tuple[Array, Array]:
+    """Increments (K, 3) of wheels and scans together, and their covariances (K, 3, 3)."""
+    return jax.vmap(motion_estimate, in_axes=(None, 0))(params, measurements)
+
+
+def _filter_again(
+    run: Run, filtered: Filtered, result: SlamResult, poses: np.ndarray, wrong: np.ndarray
+) -> Filtered:
+    """The keyframes filtered along poses (K, 3), measured as before except at wrong steps (K,)."""
+    num_saved = len(poses) - len(result.keyframes)
+    motion, wrong = increments(poses)[num_saved:], wrong[num_saved:]
+    if filtered.saved is not None:
+        state = sessions.resume(run.config, filtered.saved)
+    else:
+        state = online.init(run.config, filtered.start)
+    again = Filtered(filtered.start, state, filtered.saved)
+    ends = np.cumsum([len(chunk.keyframes) for chunk in filtered.chunks])
+    measured = []
+    for chunk, end in zip(filtered.chunks, ends.tolist(), strict=True):
+        some = slice(end - len(chunk.keyframes), end)
+        rows = np.flatnonzero(wrong[some])
+        measured.append(pieces.after_gap(chunk, rows, motion[some][rows]) if rows.size else chunk)
+        again = filter_chunks(run._replace(callback=None), again, [_along(chunk, motion[some])])
+    matches = [
+        result._replace(scan_matches=_matches_of(chunk))
+        for result, chunk in zip(again.results, measured, strict=True)
+    ]
+    return again._replace(chunks=tuple(measured), results=tuple(matches))
+
+
+def _along(chunk: KeyframeChunk, motion: np.ndarray) -> KeyframeChunk:
+    """The chunk as if its motion (N, 3) had been matched."""
+    measurements = chunk.chunk.measurements
+    match = measurements.scan_match
+    assert match is not None and match.expected is not None
+    moved = match.increment.at[: len(motion)].set(motion.astype(match.increment.dtype))
+    match = match._replace(increment=moved, expected=moved)
+    return chunk._replace(
+        chunk=chunk.chunk._replace(measurements=measurements._replace(scan_match=match))
+    )
+
+
+def _matches_of(chunk: KeyframeChunk) -> ScanMatch:
+    """The scan matches [N] of a chunk, NumPy."""
+    count = len(chunk.keyframes)
+    return jax.tree.map(lambda x: np.asarray(x)[:count], chunk.chunk.measurements.scan_match)
+
+
+def _notes(result: SlamResult, poses: np.ndarray, found: Revisits) -> tuple[str, ...]:
+    """A note for each set of places that was found again."""
+    num_saved = len(poses) - len(result.keyframes)
+    notes = []
+    for number in np.unique(found.group):
+        own = found.group == number
+        second = result.keyframes[(found.second[own] - num_saved).clip(0)]
+        first = found.first[own] - num_saved
+        where = "the saved map"
+        if (first >= 0).all():
+            scans = result.keyframes[first]
+            where = f"scans {scans.min()}-{scans.max()}"
+        notes.append(
+            f"scans {second.min()}-{second.max()} show places that {where} showed, elsewhere than "
+            f"wheels and scan matching have them: closed by {int(own.sum())} places"
+        )
+    return tuple(notes)

@@ -1,0 +1,50 @@
+"""Whether the scans of a result agree with its map, and with the saved one that it goes on in."""
+
+import jax
+import numpy as np
+
+from jaxslam.core.scan import Lidar, Scan
+from jaxslam.mapping.map_consistency import MapConsistency, check_map
+from jaxslam.mapping.saved_map import SavedMap
+
+
+def check_poses(
+    lidar: Lidar,
+    poses: np.ndarray,
+    scans: Scan,
+    piece: np.ndarray,
+    saved: tuple[SavedMap, np.ndarray] | None,
+) -> MapConsistency:
+    """Agreement of the scans of a log with its map; of a saved map's scans, as earlier visits.
+
+    Args:
+        lidar: The scanner.
+        poses: (T, 3) [m, m, rad] map frame; those that are not finite are left out.
+        scans: [T].
+        piece: (T,) int as of `check_map`.
+        saved: The saved map, and the poses (S, 3) of its keyframes in the frame of this one; None
+            where there is none. Warnings are of scans of the log alone, and numbered as these.
+    """
+    if saved is None:
+        return check_map(lidar, poses, scans, piece=piece)
+    saved_map, saved_poses = saved
+    count = len(saved_poses)
+    both = jax.tree.map(lambda *x: np.concatenate(x), saved_map.scans, scans)
+    piece = np.concatenate([np.full(count, -2), piece])  # -1 are scans without a pose
+    found = check_map(lidar, np.concatenate([saved_poses, poses]), both, piece=piece)
+    new = found.scan >= count
+    warnings = tuple(
+        warning._replace(
+            first_scan=max(warning.first_scan - count, 0), last_scan=warning.last_scan - count
+        )
+        for warning in found.warnings
+        if warning.last_scan >= count
+    )
+    return found._replace(
+        scan=found.scan[new] - count,
+        poses=found.poses[new],
+        step_contradiction=found.step_contradiction[new[1:]][1:],
+        step_confirmation=found.step_confirmation[new[1:]][1:],
+        visit_contradiction=found.visit_contradiction[new],
+        warnings=warnings,
+    )

@@ -1,0 +1,83 @@
+"""Drives whose wheels and scans were both wrong: closed where they show places twice."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from office_drive import CONFIG, LIDAR, PARAMS, office_drive, take
+
+from jaxslam.core.se2_np import increments
+from jaxslam.matching.revisits import Revisits
+from jaxslam.pipeline import offline, reclosing
+from jaxslam.simulation import ray_casting
+from jaxslam.simulation.worlds import World, outline
+
+# A ring of corridors, bare along their middle, with niches near the corners.
+BOXES = [(0, 0, 40, 16), (5, -0.6, 7, 0), (40, 3, 40.8, 4), (33, 16, 34, 17), (-0.5, 12, 0, 14)]
+BLOCKS = [(2, 2, 38, 14), (3, 0, 3.4, 0.4), (36.5, 15.6, 37, 16), (0, 3.0, 0.3, 3.6)]
+CORNERS = np.array([(1, 1), (39, 1), (39, 15), (1, 15)], float)
+MISSING = slice(67, 77)  # scans that are left out, in the middle of the first corridor
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Poses (T, 3) of a robot that drives around one and a half times, and its scans."""
+    poses = []
+    for leg in range(6):
+        start, end = CORNERS[leg % 4], CORNERS[(leg + 1) % 4]
+        for part in np.arange(0.0, 1.0, 0.3 / np.hypot(*(end - start))):
+            poses.append((*(start + part * (end - start)), leg * np.pi / 2))
+        poses += [(*end, leg * np.pi / 2 + turn) for turn in (0.4, 0.8, 1.2)]
+    poses = np.array(poses)
+    world, keys = (
+        World(jnp.asarray(outline(BOXES, BLOCKS))),
+        jax.random.split(jax.random.key(0), len(poses)),
+    )
+
+    @jax.jit
+    def cast(keys, poses):
+        def scan(key, pose):
+            return ray_casting.add_range_noise(key, LIDAR, ray_casting.cast(LIDAR, world, pose))
+
+        return jax.vmap(scan)(keys, poses)
+
+    return poses, jax.tree.map(np.asarray, cast(keys, jnp.asarray(poses)))
+
+
+def rmse(found, poses):
+    off = found.poses[:, :2] - poses[:, :2]
+    return np.sqrt(np.mean(np.sum(off**2, axis=1)))
+
+
+@pytest.mark.slow
+def test_a_step_that_looks_too_long_for_what_the_scans_show_is_found(drive, monkeypatch):
+    # Where scans are missing in a bare corridor, the motion seems to be that of the scans before.
+    poses, scans = drive
+    kept = np.delete(np.arange(len(poses)), MISSING)
+    poses, scans = poses[kept], take(scans, kept)
+    odometry = increments(poses)
+    found = offline.run_slam(CONFIG, PARAMS, odometry, scans, start=poses[0])
+    assert "closed by" in found.notes[-1] and found.consistency.explained.mean() > 0.995
+    assert rmse(found, poses) < 0.5
+    monkeypatch.setattr(reclosing, "MAX_ROUNDS", 0)
+    as_it_was = offline.run_slam(CONFIG, PARAMS, odometry, scans, start=poses[0])
+    assert rmse(as_it_was, poses) > 1.5 and "closed by" not in "".join(as_it_was.notes)
+
+
+@pytest.mark.slow
+def test_what_does_not_make_the_map_better_is_not_taken(monkeypatch):
+    poses, scans = office_drive()
+    monkeypatch.setattr(reclosing, "UNEXPLAINED", -1.0)
+    looked = []
+
+    def find_wrong(spec, scan_map):
+        """Pairs that are metres from where they are said to be."""
+        looked.append(scan_map)
+        first = np.arange(20, 60, 5)
+        wrong = np.tile([3.0, -2.0, 0.3], (len(first), 1))
+        return Revisits(first, first + 150, wrong, 0 * first)
+
+    monkeypatch.setattr(reclosing, "find_revisits", find_wrong)
+    found = offline.run_slam(CONFIG, PARAMS, increments(poses), scans, start=poses[0])
+    assert len(looked) == 1 and "closed by" not in "".join(found.notes)
+    assert rmse(found, poses) < 0.05

@@ -54,8 +54,8 @@ def run_slam(
     matched, loops are closed by matching scans of later visits with those of earlier ones
     (`loop_closure.find_loop_closures`).
 
-    Where the map contradicts itself, the drive is closed at places that are found again, metres from
-    where it has them (`reclosing`), if that makes it better; a note says so.
+    Where the map contradicts itself, the drive is closed at places that are found again, metres
+    from where it has them (`reclosing`), if that makes it better; a note says so.
 
     Where the robot was moved from one scan to the next (`breaks`), the pieces of the drive are
     mapped on their own, and joined where places are found again (`pieces`). The result is the

@@ -55,3 +55,14 @@ class TopologicalMap(NamedTuple):
     arc_lines: tuple[np.ndarray, ...]
     frontiers: tuple[np.ndarray, ...] = ()
     frontier_node: np.ndarray = np.zeros(0, int)
+
+
+def without_arcs(graph: TopologicalMap, gone: np.ndarray) -> TopologicalMap:
+    """The map without the arcs (A,) that are True; their nodes stay."""
+    kept = np.flatnonzero(~gone)
+    return graph._replace(
+        arc_ends=graph.arc_ends[kept],
+        arc_length=graph.arc_length[kept],
+        arc_clearance=graph.arc_clearance[kept],
+        arc_lines=tuple(graph.arc_lines[k] for k in kept.tolist()),
+    )

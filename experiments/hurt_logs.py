@@ -19,6 +19,7 @@ LATCHED = 0.06  # spans of latched odometry by scans
 LATCHED_LENGTHS = (2, 3, 4)  # scans from a latched pose to the leap
 LOST_TURNS, LOST_TURN = 4, 0.5  # turns that the wheels miss, and least size [rad] of each
 LOST_APART = 30  # scans between two of these, at least
+SLIP_LENGTH, SLIPPED = 4.0, 0.75  # [m] driven straight on, and share of it that the wheels miss
 DISTANCE_SCALE, TURN_SCALE = 1.05, 0.96
 MOUNT = (0.25, 0.0, math.radians(3.0))  # [m, m, rad] of the scanner on the robot
 MISSING_BEAMS, BLOCK_OF_BEAMS = 0.3, (3, 12)
@@ -158,6 +159,24 @@ def carried(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     return _with_increments(_only(recording, kept), steps)
 
 
+def slipped(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
+    """The wheels miss most of some metres straight on, and the scans of these are missing."""
+    steps = increments(recording.odom_poses)
+    driven = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))
+    turned = np.cumsum(np.abs(steps[:, 2]))
+    length = min(SLIP_LENGTH, driven[-1] / 8)
+    first = np.flatnonzero((driven > driven[-1] / 8) & (driven < driven[-1] * 7 / 8 - length))
+    last = np.searchsorted(driven, driven[first] + length)
+    straight = np.argsort(turned[last] - turned[first], kind="stable")
+    chosen = int(rng.choice(straight[: 1 + len(first) // 10]))
+    start, end = int(first[chosen]), int(last[chosen])
+    missed = relative(*recording.odom_poses[[start, end]])
+    missed[:2] *= 1.0 - SLIPPED
+    kept = np.delete(np.arange(len(steps)), slice(start + 1, end))
+    steps[end] = missed
+    return _with_increments(_only(recording, kept), steps[kept])
+
+
 def scale(rng: np.random.Generator, recording: DriveRecord) -> DriveRecord:
     """The wheels are out of calibration: distances come out too long, turns too small."""
     factors = np.array([DISTANCE_SCALE, DISTANCE_SCALE, TURN_SCALE])
@@ -213,10 +232,10 @@ FAULTS: dict[str, Fault] = {
     "stamps-coarse": on_stamps(coarse),
     "stamps-back": on_stamps(back),
     "stamps-set-back": on_stamps(set_back),
-    **{f.__name__: f for f in (unsigned, latched, lost, still, carried)},
+    **{f.__name__: f for f in (unsigned, latched, lost, still, carried, slipped)},
     **{f.__name__: f for f in (scale, mount, missing, dropped, people)},
 }
-RANDOM = {"stamps-some-zero", "stamps-back", "latched", "lost", "carried"}
+RANDOM = {"stamps-some-zero", "stamps-back", "latched", "lost", "carried", "slipped"}
 RANDOM |= {"missing", "dropped", "people"}
 """The faults that depend on the seed."""
 

@@ -50,6 +50,7 @@ def test_features_are_the_same_in_both_precisions():
     np.testing.assert_allclose(found.xy, exact.xy, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_filter_and_its_gradients():
     episodes = simulate_episodes(jax.random.key(0), CONFIG, num_trials=2, num_scans=SCANS)
     params = NoiseParams.for_simulated_robot()
@@ -61,6 +62,7 @@ def test_filter_and_its_gradients():
     assert np.isfinite(values).all() and np.isfinite(slopes).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("match_scans", [False, True])
 def test_a_log_is_mapped_and_smoothed(match_scans):
     truth, odometry, scans = scans_of_a_drive()

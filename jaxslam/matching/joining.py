@@ -29,6 +29,7 @@ from jaxslam.matching.map_places import (
     consistent_sets,
     fit_transform,
     places_between,
+    transforms_near,
 )
 from jaxslam.matching.scan_agreement import (
     CONFIRMED,
@@ -96,7 +97,8 @@ def find_join(spec: JoinSpec, first: ScanMap, second: ScanMap) -> Join:
     for members in sets:
         agreeing = FoundPlaces(*(x[members] for x in found))
         between = fit_transform(agreeing.second, agreeing.first, agreeing.weight)
-        confirmed, contradicted = compare_maps(posed_first, posed_second, between)
+        near = transforms_near(agreeing, posed_second.poses)
+        confirmed, contradicted = compare_maps(posed_first, posed_second, near)
         value = confirmed - CONTRADICTION_COST * contradicted
         share = contradicted / max(confirmed + contradicted, 1)
         gaps = agreeing.second[:, None, :2] - agreeing.second[None, :, :2]
@@ -143,30 +145,41 @@ def compare_maps(first: PosedScans, second: PosedScans, between: np.ndarray) -> 
     """Ends of beams that two maps confirm, and that contradict, where their scans are near.
 
     Args:
-        first: Scans of one map.
-        second: Scans of another one.
-        between: (3,) [m, m, rad] frame of the second in that of the first.
+        first: Scans [K] of one map.
+        second: Scans [N] of another one.
+        between: (3,) or (N, 3) [m, m, rad] frame of the second in that of the first, or where each
+            of its scans has it.
     """
-    poses, ends = compose(between, second.poses), transform(between, second.ends)
+    between = np.broadcast_to(between, second.poses.shape)
+    poses, ends = compose(between, second.poses), transform(between[:, None], second.ends)
+    count = len(first.poses)
     both = PosedScans(
-        np.arange(len(first.poses) + len(poses)),
+        np.arange(count + len(poses)),
         np.concatenate([first.poses, poses]),
         np.concatenate([first.travelled, second.travelled]),
         first.angles,
         np.concatenate([first.ranges, second.ranges]),
         np.concatenate([first.ends, ends]),
     )
-    near = cKDTree(first.poses[:, :2]).query_ball_point(poses[:, :2], VIEW_RADIUS)
+    pairs = [(own, count + other) for other, own in _nearest_scans(first.poses, poses)]
+    pairs += [(own, count + other) for own, other in _nearest_scans(poses, first.poses)]
+    if not pairs:
+        return 0.0, 0.0
+    pairs = sorted(set(pairs))
+    agreement = ScanComparison(both).compare(*np.array(pairs).T)
+    return float(agreement.num_ends(CONFIRMED).sum()), float(agreement.num_ends(CONTRADICTED).sum())
+
+
+def _nearest_scans(poses: np.ndarray, of: np.ndarray) -> list[tuple[int, int]]:
+    """For each of poses (N, 3) the `VIEWS` scans at poses (K, 3) that are most like it, if near."""
+    near = cKDTree(poses[:, :2]).query_ball_point(of[:, :2], VIEW_RADIUS)
     pairs = []
     for scan, others in enumerate(near):
         index = np.array(others, int)
-        off = first.poses[index] - poses[scan]
+        off = poses[index] - of[scan]
         cost = np.hypot(off[:, 0], off[:, 1]) + 0.5 * np.abs(wrap_angle(off[:, 2]))
-        pairs += [(len(first.poses) + scan, k) for k in index[np.argsort(cost)[:VIEWS]].tolist()]
-    if not pairs:
-        return 0.0, 0.0
-    agreement = ScanComparison(both).compare(*np.array(pairs).T)
-    return float(agreement.num_ends(CONFIRMED).sum()), float(agreement.num_ends(CONTRADICTED).sum())
+        pairs += [(scan, k) for k in index[np.argsort(cost)[:VIEWS]].tolist()]
+    return pairs
 
 
 def posed_scans_of(scan_map: ScanMap) -> PosedScans:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.spatial import cKDTree
 
 from jaxslam.core import trace_cache
 from jaxslam.core.batching import on_device
@@ -39,6 +40,9 @@ SAME_TRANSFORM = 1.5
 
 MIN_PLACE_SCORE = 0.5
 """Score of a place that is a hypothesis at all."""
+
+NEAR = 8.0
+"""[m] between places up to which one transform holds."""
 
 HEADING_ARM = 5.0
 """[m] std of a place found, over that of its heading."""
@@ -233,3 +237,16 @@ def fit_transform(own: np.ndarray, other: np.ndarray, weight: np.ndarray) -> np.
     heading = np.arctan2(sine, cosine)
     offset = goal - transform(np.array([0.0, 0.0, heading]), centre)
     return np.append(offset, heading)
+
+
+def transforms_near(found: FoundPlaces, poses: np.ndarray) -> np.ndarray:
+    """Transforms (K, 3) of a set of hypotheses at poses (K, 3) of the second map.
+
+    Each is that of the places near the one that is nearest: where maps have drifted, one transform
+    does not hold all over.
+    """
+    step = found.second[:, None, :2] - found.second[None, :, :2]
+    near = np.hypot(step[..., 0], step[..., 1]) < NEAR
+    own = [fit_transform(found.second[k], found.first[k], found.weight[k]) for k in near]
+    nearest = cKDTree(found.second[:, :2]).query(poses[:, :2])[1]
+    return np.stack(own)[nearest]

@@ -48,9 +48,6 @@ MIN_BETWEEN = 15.0
 SAME_PLACE = (0.3, 0.06)
 """[m], [rad] from where the drive has a place, within which it was found where it is."""
 
-NEAR = 8.0
-"""[m] between places up to which one transform holds: loops that were closed bend a drive."""
-
 MAX_DRIFT = (2.0, 0.1, 1.2)
 """[m], fraction of the path between two visits, [rad]: the drift between them, at most."""
 
@@ -231,19 +228,19 @@ def _compare(
     A place is confirmed if they agree there, and not as well where the drive has the later visit,
     with all scans up to the earlier one: along a corridor, both may be so.
     """
-    weight, first, second = (x[members] for x in hypotheses.found[1:])
+    agreeing = FoundPlaces(*(x[members] for x in hypotheses.found))
     best = _best_of_each_query(hypotheses.found, members)
+    transforms = map_places.transforms_near(agreeing, hypotheses.found.second[best])
     there, as_it_is = np.zeros((2, len(best), 2))
     for number, hypothesis in enumerate(best.tolist()):
-        off = second - hypotheses.found.second[hypothesis]
-        near = np.hypot(off[:, 0], off[:, 1]) < NEAR
-        between = map_places.fit_transform(second[near], first[near], weight[near])
         from_first, from_second = (
             posed.travelled - driven[keyframes[hypothesis]]
             for keyframes in (hypotheses.first, hypotheses.second)
         )
         later = posed.only(np.abs(from_second) <= AROUND)
-        there[number] = compare_maps(posed.only(np.abs(from_first) <= AROUND), later, between)
+        there[number] = compare_maps(
+            posed.only(np.abs(from_first) <= AROUND), later, transforms[number]
+        )
         moved = relative(*(x[hypothesis] for x in hypotheses.found[2:]))
         before = posed.only(from_first <= AROUND + np.hypot(moved[0], moved[1]))
         as_it_is[number] = compare_maps(before, later, np.zeros(3))

@@ -37,13 +37,23 @@ class Run(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """Keyframes that the filter was given: its start, its state after them, and its results."""
+    """Keyframes that the filter was given.
+
+    Attributes:
+        start: (3,) [m, m, rad] first pose.
+        state: After them.
+        saved: The map that they go on in, if there is one.
+        chunks: The keyframes.
+        results: Of the filter; their scan matches are what the smoother is given.
+        notes: How they were put together.
+    """
 
     start: Any
     state: SlamState
     saved: SavedMap | None = None
     chunks: tuple[KeyframeChunk, ...] = ()
     results: tuple[ChunkResult, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def filter_chunks(run: Run, filtered: Filtered, chunks: Sequence[KeyframeChunk]) -> Filtered:
@@ -78,14 +88,15 @@ def _without_blocked(
     return without_arcs(graph, blocked), (f"{what} gone: the last scans there see obstacles on it",)
 
 
-def result_of(
-    run: Run,
-    filtered: Filtered,
-    guess: np.ndarray | None = None,
-    notes: tuple[str, ...] = (),
-) -> SlamResult:
-    """The result of keyframes that were filtered, smoothed if that is asked for."""
-    state, config = filtered.state, run.config
+def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> SlamResult:
+    """The result of keyframes that were filtered, smoothed if that is asked for.
+
+    Args:
+        run: What all stages need.
+        filtered: The keyframes.
+        guess: (K, 3) as of `smooth_result`.
+    """
+    state, config, notes = filtered.state, run.config, filtered.notes
     info, features, matches, numbers = stages.concatenate(list(filtered.results))
     keyframe_odometry = np.concatenate([chunk.odometry for chunk in filtered.chunks])
     matched = stages.concatenate([chunk.matched for chunk in filtered.chunks])

@@ -194,7 +194,8 @@ def _several_pieces(
                     filtered,
                     [pieces.after_gap(chunks[0], np.array([0]), gap[None]), *chunks[1:]],
                 )
-            result = result_of(run, filtered, np.concatenate(own), _notes(group, alone))
+            filtered = filtered._replace(notes=_notes(group, alone))
+            result = result_of(run, filtered, np.concatenate(own))
             results.append(reclosing.close_again(quiet, filtered, result)[1])
         elif number != pieces.SAVED:
             results.append(found[number])
@@ -202,7 +203,7 @@ def _several_pieces(
 
 
 def _notes(group: Group, alone: Mapping[int, Filtered]) -> tuple[str, ...]:
-    """A note of what the pieces of a group are, and of how they were joined."""
+    """The notes of the pieces of a group, and one of how they were joined."""
     names = []
     for number in group.pieces:
         chunks = alone[number].chunks
@@ -212,4 +213,5 @@ def _notes(group: Group, alone: Mapping[int, Filtered]) -> tuple[str, ...]:
     how = [f"by {min(places)} places that were found again"] if places else []
     if len(places) < len(group.joins):
         how.append("as scan matching has it across a break")
-    return (f"{' and '.join(names)} were mapped alone, and joined {', or '.join(how)}",)
+    joined = f"{' and '.join(names)} were mapped alone, and joined {', or '.join(how)}"
+    return (*[note for k in group.pieces for note in alone[k].notes], joined)

@@ -83,8 +83,8 @@ def close_again(run: Run, filtered: Filtered, result: SlamResult) -> tuple[Filte
             break
         poses, wrong = _solve(run, result, poses, measurements, found)
         again = _filter_again(run, filtered, result, poses, wrong)
-        notes = (*result.notes, *_notes(result, poses, found))
-        closed = result_of(run, again, poses, notes)
+        again = again._replace(notes=(*filtered.notes, *_notes(result, found)))
+        closed = result_of(run, again, poses)
         if not _is_better(closed.consistency, before):
             break
         filtered, result = again, closed
@@ -217,9 +217,9 @@ def _matches_of(chunk: KeyframeChunk) -> ScanMatch:
     return jax.tree.map(lambda x: np.asarray(x)[:count], chunk.chunk.measurements.scan_match)
 
 
-def _notes(result: SlamResult, poses: np.ndarray, found: Revisits) -> tuple[str, ...]:
+def _notes(result: SlamResult, found: Revisits) -> tuple[str, ...]:
     """A note for each set of places that was found again."""
-    num_saved = len(poses) - len(result.keyframes)
+    num_saved = 0 if result.saved_poses is None else len(result.saved_poses)
     notes = []
     for number in np.unique(found.group):
         own = found.group == number

@@ -187,6 +187,18 @@ def test_a_carried_robot_jumps_and_its_wheels_do_not(hurt, record):
     np.testing.assert_allclose(rest, expected, atol=1e-9)
 
 
+def test_wheels_that_slipped_miss_metres_that_no_scan_shows(hurt, record):
+    found = hurt("slipped")
+    jump = np.flatnonzero(np.diff(found.number) > 1)
+    assert len(jump) == 1
+    true = relative(*record.odom_poses[found.number[[jump[0], jump[0] + 1]]])
+    wheels = relative(*found.odom_poses[[jump[0], jump[0] + 1]])
+    np.testing.assert_allclose(wheels, true * [0.25, 0.25, 1.0], atol=1e-9)
+    rest = np.delete(increments(found.odom_poses)[1:], jump[0], axis=0)
+    expected = np.delete(increments(record.odom_poses[found.number])[1:], jump[0], axis=0)
+    np.testing.assert_allclose(rest, expected, atol=1e-9)
+
+
 def test_scale_is_that_of_distances_and_of_turns(hurt, record):
     was, now = increments(record.odom_poses), increments(hurt("scale").odom_poses)
     np.testing.assert_allclose(now, was * [1.05, 1.05, 0.96], atol=1e-9)

@@ -153,6 +153,7 @@ def test_robots_are_found_anywhere_and_tracked(drive, together):
     assert np.percentile(angle[sure], 95) < np.radians(1.0)
 
 
+@pytest.mark.slow
 def test_a_batch_is_the_same_as_its_robots_one_after_the_other(place_map, robots, together):
     scans, odometry = robots
     states = jax.vmap(lambda _: init(SPEC, LIDAR))(odometry[:, 0])

@@ -70,6 +70,7 @@ def root_of(upper, size):
     return np.linalg.cholesky(matrix + np.triu(matrix, 1).T).T
 
 
+@pytest.mark.slow
 def test_an_optimiser_finds_the_true_trajectory_in_the_pose_graph(drive, tmp_path):
     given, true = drive
     measured = relative(true[2], true[9])[None], 1e4 * np.eye(3)[None]
@@ -111,6 +112,7 @@ def test_an_optimiser_finds_the_true_trajectory_in_the_pose_graph(drive, tmp_pat
     assert 0.2 * count < 2 * best.cost < 2.0 * count  # chi-square: as large as it should be
 
 
+@pytest.mark.slow
 def test_numbers_that_are_not_finite_are_not_written(drive, tmp_path):
     graph = pose_graph.build_pose_graph(**drive[0])
     bad = graph._replace(landmark_positions=np.full_like(graph.landmark_positions, np.nan))
@@ -119,6 +121,7 @@ def test_numbers_that_are_not_finite_are_not_written(drive, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_lists_numpy_and_jax_arrays_give_the_same_pose_graph(drive):
     given = {**drive[0], "poses": np.float32(drive[0]["poses"])}
     want = pose_graph.build_pose_graph(**given)
@@ -131,6 +134,7 @@ def test_lists_numpy_and_jax_arrays_give_the_same_pose_graph(drive):
         jax.tree.map(np.testing.assert_array_equal, graph, want)
 
 
+@pytest.mark.slow
 def test_build_pose_graph_names_the_argument_that_does_not_fit(drive):
     measurements, info = drive[0]["measurements"], drive[0]["info"]
     for wrong, problem in (

@@ -312,6 +312,7 @@ def test_a_corridor_and_wheels_that_are_wrong_teach_no_scale(case):
     assert found.wheel_scale == 1.0 and found.scale_information == history.scale_information
 
 
+@pytest.mark.slow
 def test_noise_of_the_wheels_does_not_bias_their_scale():
     """Steps of 3 cm, with 1 cm of noise: least squares would have the scale a tenth too small."""
     rng, history = np.random.default_rng(1), motion_prior.first_history()

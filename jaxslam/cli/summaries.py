@@ -71,7 +71,9 @@ def _print_consistency(consistency: Metrics) -> None:
     """Print the share of scans that the map explains, and how far walls of two visits are apart."""
     walls = consistency["walls_median_m"]
     distance = "" if walls is None else f"{walls:10.3f}"
-    print(f"  {'explained scans, wall offset [m]':34}{consistency['explained']:10.1%}{distance}")
+    explained = consistency["explained"]
+    share = f"{'-':>10}" if explained is None else f"{explained:10.1%}"
+    print(f"  {'explained scans, wall offset [m]':34}{share}{distance}")
 
 
 def _print_warnings(warnings: Sequence[Metrics]) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import inverse_transform
-from jaxslam.matching.scan_agreement import PosedScans, posed_scans
+from jaxslam.matching.scan_agreement import moved
 
 LOOKS, MIN_BLOCKED = 6, 5
 """Last looks at a point that count, and how many of them have to find it blocked."""
@@ -48,20 +48,19 @@ def blocked_arcs(
     blocked = np.zeros(len(lines), bool)
     if not len(lines) or not len(poses):
         return blocked
-    ranges, hit = np.asarray(scans.ranges, float), np.asarray(scans.hit)
-    posed = posed_scans(lidar, poses, ranges, hit)
     pieces = [_points(line) for line in lines]
     points, arc = np.concatenate(pieces), np.repeat(np.arange(len(lines)), list(map(len, pieces)))
-    width = np.fmin(ON_ARC, 0.5 * clearance)[arc]
-    looks = [_looks(posed, k, points, near, width) for k, near in _near(posed, points)]
-    point = np.concatenate([number for number, _ in looks])
-    is_blocked = np.concatenate([state for _, state in looks])
-    order = np.argsort(point, kind="stable")[::-1]  # of each point the last look first
-    point, is_blocked = point[order], is_blocked[order]
-    first = np.flatnonzero(np.diff(point, prepend=-1))
-    rank = np.arange(len(point)) - np.repeat(first, np.diff(np.append(first, len(point))))
-    count = np.bincount(point[(rank < LOOKS) & is_blocked], minlength=len(points))
-    blocked[arc[count >= MIN_BLOCKED]] = True
+    width, tree = np.fmin(ON_ARC, 0.5 * clearance)[arc], cKDTree(points)
+    ranges = np.where(np.asarray(scans.hit), np.asarray(scans.ranges, float), np.nan)
+    num_looks, num_blocked = np.zeros((2, len(points)), int)
+    for number in moved(poses)[::-1].tolist():
+        near = np.array(tree.query_ball_point(poses[number, :2], REACH), int)
+        near = near[num_looks[near] < LOOKS]
+        local = inverse_transform(poses[number], points[near])
+        free, on_wall = _look(lidar, ranges[number], local, width[near])
+        num_looks[near] += free | on_wall
+        num_blocked[near] += on_wall
+    blocked[arc[num_blocked >= MIN_BLOCKED]] = True
     return blocked
 
 
@@ -73,34 +72,25 @@ def _points(line: np.ndarray) -> np.ndarray:
     return np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])
 
 
-def _near(posed: PosedScans, points: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """Scans in the order of time, and the points that are near each."""
-    near = cKDTree(points).query_ball_point(posed.poses[:, :2], REACH)
-    return [(k, np.array(some, int)) for k, some in enumerate(near)]
-
-
-def _looks(
-    posed: PosedScans, scan: int, points: np.ndarray, near: np.ndarray, width: np.ndarray
+def _look(
+    lidar: Lidar, ranges: np.ndarray, points: np.ndarray, width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (N,) of the points that one scan looks at, and whether it sees a wall there.
+    """Whether points (N, 2) are free, or on a wall, by the two beams of a scan beside each.
 
     Args:
-        posed: All scans.
-        scan: Number of the scan.
-        points: (P, 2) [m] of all arcs.
-        near: Numbers of those near the scan.
-        width: (P,) [m] from a point within which a wall blocks it.
+        lidar: The scanner.
+        ranges: (R,) [m]; NaN without a return, which shows nothing.
+        points: (N, 2) [m] robot frame.
+        width: (N,) [m] from a point within which a wall is on it.
     """
-    local = inverse_transform(posed.poses[scan], points[near])
-    bearing = np.arctan2(local[:, 1], local[:, 0]) - posed.angles[0]
-    beam = np.mod(bearing, 2 * np.pi) / (posed.angles[1] - posed.angles[0])
-    within = beam < len(posed.angles) - 1
-    left = np.where(within, beam, 0.0).astype(int)
-    both = np.stack([left, left + 1])
-    ranges, distance = posed.ranges[scan, both], np.hypot(local[:, 0], local[:, 1])
-    within &= np.isfinite(ranges).all(axis=0)
-    gap = np.linalg.norm(posed.ends[scan, both] - points[near][None], axis=-1)
-    blocked = within & (gap.min(axis=0) < width[near])
-    free = within & ~blocked & (ranges.min(axis=0) > distance + BEYOND)
-    seen = blocked | free
-    return near[seen], blocked[seen]
+    bearing, distance = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    beam = np.mod(bearing - lidar.angle_min, 2 * np.pi) / lidar.angle_increment
+    count = lidar.num_beams
+    is_full_turn = (count + 0.5) * lidar.angle_increment > 2 * np.pi
+    left = np.minimum(beam.astype(int), count - 1)
+    both = np.stack([left, (left + 1) % count])
+    angle, depth = lidar.angle_min + lidar.angle_increment * both, ranges[both]
+    seen = np.isfinite(depth).all(axis=0) & ((beam < count - 1) | is_full_turn)
+    gap = np.hypot(depth * np.cos(angle) - points[:, 0], depth * np.sin(angle) - points[:, 1])
+    on_wall = seen & (gap.min(axis=0) < width)
+    return seen & ~on_wall & (depth.min(axis=0) > distance + BEYOND), on_wall

@@ -68,7 +68,7 @@ class MapConsistency(NamedTuple):
         if self.wall_distance.size:
             median, p90 = np.quantile(self.wall_distance, [0.5, 0.9]).tolist()
         return {
-            "explained": float(np.mean(self.explained)),
+            "explained": float(np.mean(self.explained)) if len(self.scan) else None,
             "walls_median_m": median,
             "walls_p90_m": p90,
             "warnings": [
@@ -79,7 +79,12 @@ class MapConsistency(NamedTuple):
 
 
 def check_map(
-    lidar: Lidar, poses: ArrayLike, scans: Scan, *, piece: ArrayLike | None = None
+    lidar: Lidar,
+    poses: ArrayLike,
+    scans: Scan,
+    *,
+    piece: ArrayLike | None = None,
+    since: int = 0,
 ) -> MapConsistency:
     """Compare each scan with its neighbours in time and with other visits to the same place.
 
@@ -101,6 +106,7 @@ def check_map(
         scans: [T].
         piece: (T,) int piece of a broken drive that each scan is in, as `SlamResult.piece`: across
             a break, neighbours show different places. None for one drive.
+        since: Number of the first scan whose visits are checked: scans before it are earlier ones.
 
     Raises:
         ValueError: The scanner is impossible, no pose is finite, or shapes do not fit.
@@ -123,6 +129,7 @@ def check_map(
     comparison, num_scans = ScanComparison(posed), len(posed.number)
     of_scan = piece[posed.number]
     steps, visits = _neighbours(num_scans), _earlier_visits(posed, of_scan)
+    visits = visits[posed.number[visits[:, 0]] >= since]
     by_step, by_visit = comparison.compare(*steps.T), comparison.compare(*visits.T)
     by_step = by_step.of_pairs(of_scan[steps[:, 0]] == of_scan[steps[:, 1]])
     before, after = _lasting(steps, by_step, num_scans)

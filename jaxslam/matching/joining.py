@@ -9,7 +9,8 @@ places in both maps: buildings are symmetric. Its value is
 
     places that agree * (confirmed ends - CONTRADICTION_COST * contradicted ends)
 
-with the ends of beams that the other map's scans see on a wall, or see to be in free space.
+with the ends of beams that the other map's scans see on a wall, or see to be in free space. Scans
+are compared by the transform of the places near them, as maps drift (`transforms_near`).
 That transform is accepted which is better than all others by far, rests on several places, and
 hardly contradicts itself. One place alone never joins two maps.
 """
@@ -43,7 +44,7 @@ VIEW_RADIUS = 4.0
 """[m] between two scans that are compared."""
 
 VIEWS = 3
-"""Scans of the other map that each scan is compared with, at most."""
+"""Scans of the other map that each scan chooses to be compared with, at most."""
 
 CONTRADICTION_COST = 3.0
 """Confirmed ends that one contradicted end outweighs."""
@@ -57,7 +58,8 @@ class Join(NamedTuple):
         accepted: Whether the maps are joined by it.
         num_places: Places that agree.
         span: [m] largest distance between two of them.
-        contradiction: Share of the ends that contradict, of those compared.
+        contradiction: Share of the ends that contradict, of those compared, by the transforms that
+            hold near each place: over long maps, `transform` is off by their drift.
         rival: Value of the best other transform, as a fraction of that of this one.
     """
 
@@ -165,13 +167,13 @@ def compare_maps(first: PosedScans, second: PosedScans, between: np.ndarray) -> 
     pairs += [(own, count + other) for own, other in _nearest_scans(poses, first.poses)]
     if not pairs:
         return 0.0, 0.0
-    pairs = sorted(set(pairs))
-    agreement = ScanComparison(both).compare(*np.array(pairs).T)
+    used, index = np.unique(sorted(set(pairs)), return_inverse=True)
+    agreement = ScanComparison(both.only(used)).compare(*index.reshape(-1, 2).T)
     return float(agreement.num_ends(CONFIRMED).sum()), float(agreement.num_ends(CONTRADICTED).sum())
 
 
 def _nearest_scans(poses: np.ndarray, of: np.ndarray) -> list[tuple[int, int]]:
-    """For each of poses (N, 3) the `VIEWS` scans at poses (K, 3) that are most like it, if near."""
+    """For each of the poses `of` (N, 3) the `VIEWS` of poses (K, 3) that are most like it, near."""
     near = cKDTree(poses[:, :2]).query_ball_point(of[:, :2], VIEW_RADIUS)
     pairs = []
     for scan, others in enumerate(near):

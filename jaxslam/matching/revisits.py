@@ -15,6 +15,7 @@ where two maps are joined (`joining`), only a set of places that agree on it is 
 scans of both visits agree as well, and no other set explains the same scans.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -34,7 +35,10 @@ OVERLAP = 6.0
 """[m] before and after that are on it, too."""
 
 MAX_SHEETS = 40
-"""Sheets of an atlas at most; they are longer then."""
+"""Sheets of an atlas, at most; a long drive has several."""
+
+MAX_SPACING = 5.0
+"""[m] driven from one place that is looked for to the next, at most."""
 
 REACH = 12.0
 """[m] of a scan that is on a sheet."""
@@ -107,7 +111,7 @@ def find_revisits(spec: JoinSpec, scan_map: ScanMap) -> Revisits:
 
     Args:
         spec: Options, as where two maps are joined.
-        scan_map: The drive, its poses as they are estimated.
+        scan_map: The drive, its poses as they are estimated. Leaps between pieces count as driven.
 
     Raises:
         ValueError: An option is out of range, or poses and scans are not K >= 1 each, and finite.
@@ -145,13 +149,19 @@ def find_revisits(spec: JoinSpec, scan_map: ScanMap) -> Revisits:
 def _hypotheses(spec: JoinSpec, scan_map: ScanMap, driven: np.ndarray) -> _Hypotheses:
     """Places that were found in another visit, elsewhere than the drive has them."""
     poses = scan_map.poses
-    spec = spec._replace(place=spec.place._replace(num_candidates=NUM_CANDIDATES))
-    atlas = _make_atlas(spec, scan_map, driven)
-    keyframes = map_places.query_keyframes(spec, poses)
-    found, scores = map_places.all_places(spec, atlas.places, scan_map, keyframes)
-    query, candidate = np.nonzero(scores > map_places.MIN_PLACE_SCORE)
-    weight = scores[query, candidate] - map_places.MIN_PLACE_SCORE
-    at, other = _in_drive(atlas, poses, found[query, candidate])
+    spec = spec._replace(
+        place=spec.place._replace(num_candidates=NUM_CANDIDATES),
+        max_queries=max(spec.max_queries, math.ceil(driven[-1] / MAX_SPACING)),
+    )
+    keyframes, sheets = map_places.query_keyframes(spec, poses), _sheets(driven)
+    parts = []
+    for start in range(0, len(sheets), MAX_SHEETS):
+        atlas = _make_atlas(spec, scan_map, sheets[start : start + MAX_SHEETS])
+        found, scores = map_places.all_places(spec, atlas.places, scan_map, keyframes)
+        query, candidate = np.nonzero(scores > map_places.MIN_PLACE_SCORE)
+        weight = scores[query, candidate] - map_places.MIN_PLACE_SCORE
+        parts.append((query, weight, *_in_drive(atlas, poses, found[query, candidate])))
+    query, weight, at, other = (np.concatenate(x) for x in zip(*parts, strict=True))
     own = keyframes[query]
     swap = (other > own)[:, None]  # the query is of the earlier visit
     first, second = np.where(swap, poses[own], at), np.where(swap, at, poses[own])
@@ -181,16 +191,20 @@ class _Atlas(NamedTuple):
     keyframes: list[np.ndarray]
 
 
-def _make_atlas(spec: JoinSpec, scan_map: ScanMap, driven: np.ndarray) -> _Atlas:
-    """Parts of a drive, each on a sheet; those near its ends are on the next sheets, too."""
-    lidar, poses, scans = scan_map
-    count = min(max(round(driven[-1] / SHEET_LENGTH), 1), MAX_SHEETS)
+def _sheets(driven: np.ndarray) -> list[np.ndarray]:
+    """Keyframes of each part of a drive; those near its ends are of the next parts, too."""
+    count = max(round(driven[-1] / SHEET_LENGTH), 1)
     bounds = np.linspace(0.0, driven[-1], count + 1)
     sheets = [
         np.flatnonzero((driven >= low - OVERLAP) & (driven <= high + OVERLAP))
         for low, high in zip(bounds[:-1], bounds[1:], strict=True)
     ]
-    sheets = [sheet for sheet in sheets if sheet.size]
+    return [sheet for sheet in sheets if sheet.size]
+
+
+def _make_atlas(spec: JoinSpec, scan_map: ScanMap, sheets: list[np.ndarray]) -> _Atlas:
+    """Parts of a drive side by side."""
+    lidar, poses, scans = scan_map
     low = np.array([poses[sheet, :2].min(axis=0) for sheet in sheets]) - REACH
     width = np.array([poses[sheet, 0].max() for sheet in sheets]) + REACH - low[:, 0]
     edges = np.append(0.0, np.cumsum(width))
@@ -226,7 +240,7 @@ def _compare(
     """Compare the scans of both visits at each place of a set, by the places near it.
 
     A place is confirmed if they agree there, and not as well where the drive has the later visit,
-    with all scans up to the earlier one: along a corridor, both may be so.
+    with the scans up to about the earlier one: along a corridor, both may be so.
     """
     agreeing = FoundPlaces(*(x[members] for x in hypotheses.found))
     best = _best_of_each_query(hypotheses.found, members)
@@ -242,7 +256,8 @@ def _compare(
             posed.only(np.abs(from_first) <= AROUND), later, transforms[number]
         )
         moved = relative(*(x[hypothesis] for x in hypotheses.found[2:]))
-        before = posed.only(from_first <= AROUND + np.hypot(moved[0], moved[1]))
+        until = from_first <= AROUND + np.hypot(moved[0], moved[1])
+        before = posed.only(until & (from_second < -MIN_BETWEEN))
         as_it_is[number] = compare_maps(before, later, np.zeros(3))
     good = _agree(there) & ~(_agree(as_it_is) & (as_it_is[:, 0] > SAME * there[:, 0]))
     confirmed, at = best[good], hypotheses.found.second[best[good], :2]

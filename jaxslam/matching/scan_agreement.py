@@ -45,7 +45,7 @@ class PosedScans(NamedTuple):
     ends: np.ndarray
 
     def only(self, kept: np.ndarray) -> Self:
-        """The scans (K,) that are True."""
+        """Some of the scans, by a mask (K,) or by their indices."""
         rows = {name: getattr(self, name)[kept] for name in self._fields if name != "angles"}
         return self._replace(**rows)
 
@@ -103,7 +103,7 @@ def posed_scans(lidar: Lidar, poses: np.ndarray, ranges: np.ndarray, hit: np.nda
         ranges: (T, R') [m] of all its beams.
         hit: (T, R') bool, False where nothing returned.
     """
-    number = _moved(poses)
+    number = moved(poses)
     number = number[:: -(-len(number) // MAX_SCANS)]
     beams = np.arange(0, lidar.num_beams, -(-lidar.num_beams // MAX_BEAMS))
     angles = lidar.angle_min + lidar.angle_increment * beams
@@ -117,8 +117,8 @@ def posed_scans(lidar: Lidar, poses: np.ndarray, ranges: np.ndarray, hit: np.nda
     return PosedScans(number, poses[number], travelled, angles, ranges, ends)
 
 
-def _moved(poses: np.ndarray) -> np.ndarray:
-    """Numbers (K,) of the first scan and of those `STEP` or `TURN` from the last such one."""
+def moved(poses: np.ndarray) -> np.ndarray:
+    """Numbers (K,) of the first of poses (T, 3) and of those `STEP` or `TURN` from the last."""
     numbers, last = [0], poses[0].tolist()
     for number, (x, y, heading) in enumerate(poses.tolist()):
         turned = abs(math.remainder(heading - last[2], 2 * math.pi))

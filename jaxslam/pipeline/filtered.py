@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxslam.core.maps import TopologicalMap, without_arcs
-from jaxslam.core.measurement import Measurement
+from jaxslam.core.measurement import Measurement, ScanMatch
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import trajectories_as_one
 from jaxslam.filtering.noise import NoiseParams
@@ -45,6 +45,7 @@ class Filtered(NamedTuple):
         saved: The map that they go on in, if there is one.
         chunks: The keyframes.
         results: Of the filter; their scan matches are what the smoother is given.
+        motion: (K, 3) [m, m, rad] that the filter was given, where this is not what was matched.
         notes: How they were put together.
     """
 
@@ -53,6 +54,7 @@ class Filtered(NamedTuple):
     saved: SavedMap | None = None
     chunks: tuple[KeyframeChunk, ...] = ()
     results: tuple[ChunkResult, ...] = ()
+    motion: np.ndarray | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -67,6 +69,43 @@ def filter_chunks(run: Run, filtered: Filtered, chunks: Sequence[KeyframeChunk])
             state=state, chunks=(*filtered.chunks, now), results=(*filtered.results, result)
         )
     return filtered
+
+
+def filter_along(
+    run: Run, filtered: Filtered, chunks: Sequence[KeyframeChunk], motion: np.ndarray
+) -> Filtered:
+    """Give chunks of K keyframes to the filter as if motion (K, 3) had been matched.
+
+    The smoother is given them as they are.
+    """
+    before = len(filtered.results)
+    ends = np.cumsum([len(chunk.keyframes) for chunk in chunks])
+    given = [
+        _moved(chunk, own) for chunk, own in zip(chunks, np.split(motion, ends[:-1]), strict=True)
+    ]
+    after = filter_chunks(run, filtered, given)
+    results = [
+        result._replace(scan_matches=_matches_of(chunk))
+        for result, chunk in zip(after.results[before:], chunks, strict=True)
+    ]
+    return after._replace(chunks=(*filtered.chunks, *chunks), results=(*filtered.results, *results))
+
+
+def _moved(chunk: KeyframeChunk, motion: np.ndarray) -> KeyframeChunk:
+    """The chunk as if its motion (N, 3) had been matched."""
+    measurements = chunk.chunk.measurements
+    match = measurements.scan_match
+    assert match is not None and match.expected is not None
+    increment = match.increment.at[: len(motion)].set(motion.astype(match.increment.dtype))
+    match = match._replace(increment=increment, expected=increment)
+    measurements = measurements._replace(scan_match=match)
+    return chunk._replace(chunk=chunk.chunk._replace(measurements=measurements))
+
+
+def _matches_of(chunk: KeyframeChunk) -> ScanMatch:
+    """The scan matches [N] of a chunk, NumPy."""
+    count = len(chunk.keyframes)
+    return jax.tree.map(lambda x: np.asarray(x)[:count], chunk.chunk.measurements.scan_match)
 
 
 def scan_map(run: Run, result: SlamResult) -> ScanMap:
@@ -84,8 +123,8 @@ def _without_blocked(
     if not blocked.any():
         return graph, ()
     count = int(blocked.sum())
-    what = "1 arc is" if count == 1 else f"{count} arcs are"
-    return without_arcs(graph, blocked), (f"{what} gone: the last scans there see obstacles on it",)
+    what, on = ("1 arc is", "it") if count == 1 else (f"{count} arcs are", "them")
+    return without_arcs(graph, blocked), (f"{what} gone: the last scans see obstacles on {on}",)
 
 
 def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> SlamResult:
@@ -124,13 +163,14 @@ def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> 
             guess,
         )
         state = state._replace(belief=belief)
-        num_saved = len(smoothed) - len(keyframe_poses)
-        keyframe_poses = smoothed[num_saved:]
-        if num_saved:
-            saved_poses, closures = smoothed[:num_saved], sessions.of_new(closures, num_saved)
+        if saved_poses is not None:
+            saved_poses = smoothed[: len(saved_poses)]
+        keyframe_poses = smoothed[len(smoothed) - len(keyframe_poses) :]
         poses = keyframes.interpolate_poses(
             keyframe_poses, matched.is_keyframe, motion, matched.increments
         )
+    num_saved = 0 if saved_poses is None else len(saved_poses)
+    closures, saved_closures = sessions.split_closures(closures, num_saved)
     piece = piece_of(filtered.chunks, len(run.scans.hit))
     drives = np.split(keyframe_poses, np.flatnonzero(np.diff(piece[numbers])) + 1)
     if saved_poses is not None:
@@ -165,4 +205,5 @@ def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> 
         state.arcs,
         piece,
         saved_poses,
+        saved_closures,
     )

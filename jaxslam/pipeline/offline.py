@@ -20,7 +20,15 @@ from jaxslam.pipeline import (
     stages,
 )
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.filtered import Callback, Filtered, Run, filter_chunks, result_of, scan_map
+from jaxslam.pipeline.filtered import (
+    Callback,
+    Filtered,
+    Run,
+    filter_along,
+    filter_chunks,
+    result_of,
+    scan_map,
+)
 from jaxslam.pipeline.online import SlamState
 from jaxslam.pipeline.pieces import Group
 from jaxslam.pipeline.results import SlamResult
@@ -54,8 +62,9 @@ def run_slam(
     matched, loops are closed by matching scans of later visits with those of earlier ones
     (`loop_closure.find_loop_closures`).
 
-    Where the map contradicts itself, the drive is closed at places that are found again, metres
-    from where it has them (`reclosing`), if that makes it better; a note says so.
+    Where the map contradicts itself and is smoothed, the drive is closed at places that are found
+    again, metres from where it has them (`reclosing`), if that makes it better; a note says so. A
+    map of several drives loses arcs on which the last scans see obstacles.
 
     Where the robot was moved from one scan to the next (`breaks`), the pieces of the drive are
     mapped on their own, and joined where places are found again (`pieces`). The result is the
@@ -187,13 +196,14 @@ def _several_pieces(
             filtered = alone[number]
             own = [compose(frame, maps[k].poses) for k, frame in group.frames.items()]
             for before, after, number in zip(own, own[1:], left, strict=False):
-                chunks = alone[number].chunks
+                chunks, motion = alone[number].chunks, alone[number].motion
                 gap = relative(before[-1], after[0])
-                filtered = filter_chunks(
-                    run,
-                    filtered,
-                    [pieces.after_gap(chunks[0], np.array([0]), gap[None]), *chunks[1:]],
-                )
+                chunks = (pieces.after_gap(chunks[0], np.array([0]), gap[None]), *chunks[1:])
+                if motion is None:
+                    filtered = filter_chunks(run, filtered, chunks)
+                else:
+                    motion = np.concatenate([gap[None], motion[1:]])
+                    filtered = filter_along(run, filtered, chunks, motion)
             filtered = filtered._replace(notes=_notes(group, alone))
             result = result_of(run, filtered, np.concatenate(own))
             results.append(reclosing.close_again(quiet, filtered, result)[1])

@@ -22,8 +22,8 @@ import jax
 import numpy as np
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import on_device
-from jaxslam.core.measurement import Measurement, ScanMatch
+from jaxslam.core.batching import on_device, pad_to
+from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import increments, wrap_angle
 from jaxslam.core.types import Array
@@ -32,9 +32,9 @@ from jaxslam.mapping.map_consistency import MapConsistency
 from jaxslam.matching.map_places import ScanMap
 from jaxslam.matching.revisits import Revisits, find_revisits
 from jaxslam.pipeline import online, pieces, sessions
-from jaxslam.pipeline.filtered import Filtered, Run, filter_chunks, result_of
+from jaxslam.pipeline.filtered import Filtered, Run, filter_along, result_of
 from jaxslam.pipeline.results import SlamResult
-from jaxslam.pipeline.stages import KeyframeChunk
+from jaxslam.pipeline.smoothing_stage import PADDING_MULTIPLE
 from jaxslam.smoothing.problem import ODOMETRY_STD_FLOOR
 from jaxslam.smoothing.rotation_first import Factors, solve_rotation_first
 
@@ -56,6 +56,9 @@ LEAST_TRUST = 0.1
 UNEXPLAINED = 0.01
 """Share of the scans that may contradict a map, without a warning, before places are looked for."""
 
+SHARE_COMPARED = 0.9
+"""Share of the scans that were compared with other visits that still have to be, at least."""
+
 LESS = 0.8
 """Factor by which the scans that contradict the map have to become fewer, at least."""
 
@@ -75,16 +78,23 @@ def close_again(run: Run, filtered: Filtered, result: SlamResult) -> tuple[Filte
         return filtered, result
     for _ in range(MAX_ROUNDS):
         before = result.consistency
-        if not before.warnings and np.mean(~before.explained) <= UNEXPLAINED:
+        if not before.warnings and not np.sum(~before.explained) > UNEXPLAINED * len(before.scan):
             break
         poses, scans, measurements = _whole_drive(run, filtered, result)
         found = find_revisits(run.config.joining, ScanMap(run.config.frontend.lidar, poses, scans))
+        is_new = found.second >= len(poses) - len(result.keyframes)
+        found = Revisits(*(x[is_new] for x in found))
         if not len(found.first):
             break
         poses, wrong = _solve(run, result, poses, measurements, found)
         again = _filter_again(run, filtered, result, poses, wrong)
         again = again._replace(notes=(*filtered.notes, *_notes(result, found)))
         closed = result_of(run, again, poses)
+        info = result.info  # estimates at the time stay what they were
+        closed = closed._replace(
+            online_poses=result.online_poses,
+            info=closed.info._replace(pose=info.pose, pose_cov=info.pose_cov),
+        )
         if not _is_better(closed.consistency, before):
             break
         filtered, result = again, closed
@@ -92,9 +102,16 @@ def close_again(run: Run, filtered: Filtered, result: SlamResult) -> tuple[Filte
 
 
 def _is_better(new: MapConsistency, old: MapConsistency) -> bool:
-    """Whether a map contradicts itself clearly less than another one of the same scans."""
+    """Whether a map contradicts itself clearly less than another one of the same scans.
+
+    A drive that is torn apart contradicts itself nowhere: as many scans have to be compared.
+    """
+    compared = [int(np.isfinite(x.visit_contradiction).sum()) for x in (new, old)]
     unexplained = [float(np.mean(~x.explained)) for x in (new, old)]
-    return len(new.warnings) <= len(old.warnings) and unexplained[0] < LESS * unexplained[1]
+    if compared[0] < SHARE_COMPARED * compared[1] or len(new.warnings) > len(old.warnings):
+        return False
+    is_clear = unexplained[0] < LESS * unexplained[1]
+    return is_clear or (len(new.warnings) < len(old.warnings) and unexplained[0] <= unexplained[1])
 
 
 def _whole_drive(
@@ -118,11 +135,13 @@ def _solve(
     run: Run, result: SlamResult, poses: np.ndarray, measurements: Measurement, found: Revisits
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (K, 3) by motion, loop closures, and places found again; and wrong steps (K,)."""
-    motion = _motion(run.params, on_device(measurements))
-    increment, matched_cov = (np.asarray(x, float) for x in motion)
+    count = len(poses)
+    padded = pad_to(measurements, to=count + -count % PADDING_MULTIPLE)
+    motion = _motion(run.params, on_device(padded))
+    increment, matched_cov = (np.asarray(x, float)[:count] for x in motion)
     matched_cov = matched_cov + ODOMETRY_STD_FLOOR**2 * np.eye(3)
     cov = matched_cov * _uncertainty(measurements)[:, None, None] ** 2
-    count, num_saved = len(poses), len(poses) - len(result.keyframes)
+    num_saved = count - len(result.keyframes)
     steps, places = np.arange(1, count), len(found.first)
     parts = [
         Factors(
@@ -138,17 +157,17 @@ def _solve(
             cov=np.broadcast_to(np.diag(np.square(REVISIT_STD)), (places, 3, 3)),
         ),
     ]
-    closures = result.loop_closures
-    if closures is not None:
-        information = closures.information + np.eye(3) / CLOSURE_STD**2
-        parts.append(
-            Factors(
-                first=closures.first + num_saved,
-                second=closures.second + num_saved,
-                relative_pose=closures.relative_pose,
-                cov=np.linalg.inv(information),
+    for closures, first_of in ((result.loop_closures, num_saved), (result.saved_closures, 0)):
+        if closures is not None:
+            information = closures.information + np.eye(3) / CLOSURE_STD**2
+            parts.append(
+                Factors(
+                    first=closures.first + first_of,
+                    second=closures.second + num_saved,
+                    relative_pose=closures.relative_pose,
+                    cov=np.linalg.inv(information),
+                )
             )
-        )
     factors = Factors(*map(np.concatenate, zip(*parts, strict=True)))
     poses = solve_rotation_first(poses, factors).poses
     off = increments(poses) - increment
@@ -184,37 +203,16 @@ def _filter_again(
         state = sessions.resume(run.config, filtered.saved)
     else:
         state = online.init(run.config, filtered.start)
+    chunks, end = [], 0
+    for chunk in filtered.chunks:
+        start, end = end, end + len(chunk.keyframes)
+        rows = np.flatnonzero(wrong[start:end])
+        chunks.append(
+            pieces.after_gap(chunk, rows, motion[start:end][rows]) if rows.size else chunk
+        )
     again = Filtered(filtered.start, state, filtered.saved)
-    ends = np.cumsum([len(chunk.keyframes) for chunk in filtered.chunks])
-    measured = []
-    for chunk, end in zip(filtered.chunks, ends.tolist(), strict=True):
-        some = slice(end - len(chunk.keyframes), end)
-        rows = np.flatnonzero(wrong[some])
-        measured.append(pieces.after_gap(chunk, rows, motion[some][rows]) if rows.size else chunk)
-        again = filter_chunks(run._replace(callback=None), again, [_along(chunk, motion[some])])
-    matches = [
-        result._replace(scan_matches=_matches_of(chunk))
-        for result, chunk in zip(again.results, measured, strict=True)
-    ]
-    return again._replace(chunks=tuple(measured), results=tuple(matches))
-
-
-def _along(chunk: KeyframeChunk, motion: np.ndarray) -> KeyframeChunk:
-    """The chunk as if its motion (N, 3) had been matched."""
-    measurements = chunk.chunk.measurements
-    match = measurements.scan_match
-    assert match is not None and match.expected is not None
-    moved = match.increment.at[: len(motion)].set(motion.astype(match.increment.dtype))
-    match = match._replace(increment=moved, expected=moved)
-    return chunk._replace(
-        chunk=chunk.chunk._replace(measurements=measurements._replace(scan_match=match))
-    )
-
-
-def _matches_of(chunk: KeyframeChunk) -> ScanMatch:
-    """The scan matches [N] of a chunk, NumPy."""
-    count = len(chunk.keyframes)
-    return jax.tree.map(lambda x: np.asarray(x)[:count], chunk.chunk.measurements.scan_match)
+    again = filter_along(run._replace(callback=None), again, chunks, motion)
+    return again._replace(motion=motion)
 
 
 def _notes(result: SlamResult, found: Revisits) -> tuple[str, ...]:
@@ -223,14 +221,13 @@ def _notes(result: SlamResult, found: Revisits) -> tuple[str, ...]:
     notes = []
     for number in np.unique(found.group):
         own = found.group == number
-        second = result.keyframes[(found.second[own] - num_saved).clip(0)]
-        first = found.first[own] - num_saved
-        where = "the saved map"
-        if (first >= 0).all():
-            scans = result.keyframes[first]
-            where = f"scans {scans.min()}-{scans.max()}"
+        first, second = (x[own] - num_saved for x in (found.first, found.second))
+        later, earlier = result.keyframes[second], result.keyframes[first[first >= 0]]
+        where = [f"scans {earlier.min()}-{earlier.max()}"] if earlier.size else []
+        where += ["the saved map"] if (first < 0).any() else []
         notes.append(
-            f"scans {second.min()}-{second.max()} show places that {where} showed, elsewhere than "
-            f"wheels and scan matching have them: closed by {int(own.sum())} places"
+            f"scans {later.min()}-{later.max()} show places that {' and '.join(where)} showed, "
+            "elsewhere than wheels and scan matching have them: closed by "
+            f"{np.count_nonzero(own)} places"
         )
     return tuple(notes)

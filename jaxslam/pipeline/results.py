@@ -23,7 +23,8 @@ class SlamResult(NamedTuple):
         poses: (T, 3) float64 [m, m, rad] estimated trajectory, map frame: filtered, or smoothed;
             NaN for scans that are in none of its pieces.
         online_poses: (T, 3) float64 [m, m, rad] estimates at the time: those of the filter, and
-            between keyframes the matched motion since.
+            between keyframes the matched motion since. Where pieces were joined, the filter was
+            run again, knowing that.
         keyframes: (K,) int numbers of the keyframes, which the filter was given; the first and the
             last scan of each piece are among them. All scans where `config.keyframe_distance` is
             None.
@@ -39,8 +40,9 @@ class SlamResult(NamedTuple):
             they are between keyframes, by their index 0 .. K - 1.
         odometry: (K, 3) [m, m, rad] increments since the keyframe before that the filter was given:
             repaired, or zero where odometry is not used.
-        notes: What was wrong with the odometry, to be printed.
-        arcs: Arcs that the topological map is made of, as observed; to go on from.
+        notes: What was corrected, joined or left out, to be printed.
+        arcs: Arcs that the topological map is made of, as observed, and those that are gone; to go
+            on from.
         piece: (T,) int piece of the drive that each scan is in, from 0; -1 for scans that are not
             in this map.
         saved_poses: (S, 3) float64 [m, m, rad] of the keyframes of the saved map that this one goes
@@ -64,6 +66,7 @@ class SlamResult(NamedTuple):
     arcs: ArcTable | None = None
     piece: np.ndarray = np.zeros(0, int)
     saved_poses: np.ndarray | None = None
+    saved_closures: LoopClosures | None = None
     other_parts: "tuple[SlamResult, ...]" = ()
 
 

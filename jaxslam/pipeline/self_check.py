@@ -31,7 +31,8 @@ def check_poses(
     count = len(saved_poses)
     both = jax.tree.map(lambda *x: np.concatenate(x), saved_map.scans, scans)
     piece = np.concatenate([np.full(count, -2), piece])  # -1 are scans without a pose
-    found = check_map(lidar, np.concatenate([saved_poses, poses]), both, piece=piece)
+    poses = np.concatenate([saved_poses, poses])
+    found = check_map(lidar, poses, both, piece=piece, since=count)
     new = found.scan >= count
     warnings = tuple(
         warning._replace(

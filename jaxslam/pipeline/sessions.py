@@ -106,10 +106,18 @@ def with_saved_keyframes(
     return given, info._replace(id=ids, pose=poses), both  # type: ignore[arg-type]
 
 
-def of_new(closures: LoopClosures | None, num_saved: int) -> LoopClosures | None:
-    """The loop closures among the keyframes after the saved ones, numbered from these on."""
-    if closures is None:
-        return None
-    new = np.minimum(closures.first, closures.second) >= num_saved
-    kept = LoopClosures(*(x[new] for x in closures))
-    return kept._replace(first=kept.first - num_saved, second=kept.second - num_saved)
+def split_closures(
+    closures: LoopClosures | None, num_saved: int
+) -> tuple[LoopClosures | None, LoopClosures | None]:
+    """Loop closures among the keyframes after the saved ones, and of these with saved ones.
+
+    The keyframes after the saved ones are numbered from 0 on.
+    """
+    if closures is None or not num_saved:
+        return closures, None
+    early, late = closures.first >= num_saved, closures.second >= num_saved
+    new, between = (LoopClosures(*(x[kept] for x in closures)) for kept in (early, late & ~early))
+    return (
+        new._replace(first=new.first - num_saved, second=new.second - num_saved),
+        between._replace(second=between.second - num_saved),
+    )

@@ -8,9 +8,9 @@ one, as soon as it is known which multiple of 2 pi each difference has:
 
 So a loop that is metres open is closed where a nonlinear solver, which starts from the poses as
 they are, would take the closure for an outlier. All factors have a kernel of Geman and
-McClure whose scale shrinks, from where it hardly differs from least squares (graduated
-non-convexity): if a few of them alone can explain the rest, as where wheels slipped once, these are
-found.
+McClure whose scale shrinks, from the least-squares solution and about its largest residual on
+(graduated non-convexity): if a few of them alone can explain the rest, as where wheels slipped
+once, these are found.
 
 References:
     Carlone, Aragues, Castellanos, Bona (2014), A fast and accurate approximation for planar pose
@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from jaxslam.core.se2_np import relative, wrap_angle
@@ -70,22 +71,22 @@ def solve_rotation_first(poses: np.ndarray, factors: Factors) -> Solution:
     """Poses that fit robust factors; their guess matters only for multiples of 2 pi.
 
     Args:
-        poses: (T, 3) [m, m, rad] guess; each heading differs by less than pi from what is right.
+        poses: (T, 3) [m, m, rad] guess; the difference of the headings of two poses that a factor
+            joins is wrong by less than pi.
         factors: They join each pose to the first one.
 
     Raises:
-        ValueError: Shapes do not fit, or poses are not joined.
+        ValueError: Arrays do not fit or are not finite, or poses are not joined.
     """
     poses = as_float64("poses", poses, ("T", 3)).copy()
-    count = len(factors.first)
-    for name in ("relative_pose", "cov"):
-        shape = (count, 3) if name == "relative_pose" else (count, 3, 3)
-        as_float64(f"factors.{name}", getattr(factors, name), shape)
+    factors = _as_factors(factors, len(poses))
     first, second = factors.first, factors.second
+    if len(poses) == 1:
+        return Solution(poses, np.ones((0, 2)))
     off = relative(poses[first], poses[second])[:, 2] - factors.relative_pose[:, 2]
     root = 1.0 / np.sqrt(factors.cov[:, 2, 2])[:, None, None]
     turned, heading_weight = _robust(
-        len(poses), factors, root, -wrap_angle(off)[:, None], np.ones(count)
+        len(poses), factors, root, -wrap_angle(off)[:, None], np.ones(len(first))
     )
     poses[:, 2] = poses[:, 2] + turned[:, 0]
     heading = poses[first, 2]
@@ -98,6 +99,29 @@ def solve_rotation_first(poses: np.ndarray, factors: Factors) -> Solution:
     poses[:, :2] = poses[0, :2] + moved
     poses[:, 2] = wrap_angle(poses[:, 2])
     return Solution(poses, np.stack([heading_weight, weight], axis=1))
+
+
+def _as_factors(factors: Factors, num_poses: int) -> Factors:
+    """Factors in NumPy arrays, checked.
+
+    Raises:
+        ValueError: An array has another shape, or is not finite; a pose is joined to no other.
+    """
+    count = len(factors.first)
+    checked = {
+        name: as_float64(f"factors.{name}", getattr(factors, name), shape)
+        for name, shape in (("relative_pose", (count, 3)), ("cov", (count, 3, 3)))
+    }
+    for name, array in checked.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"factors.{name} is not finite")
+    ends = np.asarray(factors.first), np.asarray(factors.second)
+    graph = sparse.coo_matrix((np.ones(count), ends), (num_poses, num_poses))
+    parts, number = connected_components(graph, directed=False)
+    if parts > 1:
+        alone = int(np.flatnonzero(number != number[0])[0])
+        raise ValueError(f"factors: pose {alone} is not joined to the first one")
+    return Factors(*ends, **checked)
 
 
 def _robust(

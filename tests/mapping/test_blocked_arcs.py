@@ -21,9 +21,9 @@ LINES = (
 CLEARANCE = np.array([1.6, 0.6, np.nan])
 
 
-def scans_of(poses, blocks):
-    world = World(jnp.asarray(outline(ROOM, blocks), float))
-    cast = jax.vmap(lambda pose: ray_casting.cast(LIDAR, world, pose))
+def scans_of(poses, blocks, room=ROOM, lidar=LIDAR):
+    world = World(jnp.asarray(outline(room, blocks), float))
+    cast = jax.vmap(lambda pose: ray_casting.cast(lidar, world, pose))
     return jax.tree.map(np.asarray, cast(jnp.asarray(poses)))
 
 
@@ -60,6 +60,21 @@ def test_the_last_looks_decide(visits, expected):
 def test_as_many_looks_are_needed_as_are_said():
     alone = [blocked_after((9, False), (count, True))[0] for count in range(2, LOOKS + 2)]
     assert alone == [count >= MIN_BLOCKED for count in range(2, LOOKS + 2)]
+
+
+@pytest.mark.parametrize("y", [1.9, 1.98, 1.99, 2.0, 2.01, 2.02, 2.1])
+@pytest.mark.parametrize("first", [-np.pi, 0.0])
+def test_an_obstacle_that_was_taken_away_is_gone_in_a_long_room_and_behind_the_robot(y, first):
+    lidar = Lidar(num_beams=360, angle_min=first, angle_increment=np.pi / 180, range_max=80.0)
+    poses = np.stack([np.linspace(6.0, 8.5, 9), np.full(9, 2.0), np.zeros(9)], axis=1)
+    scans = [
+        scans_of(x, blocks, [(0, 0, 40, 4)], lidar) for x, blocks in ((poses, BOX), (poses, []))
+    ]
+    scans = Scan(*(np.concatenate(x) for x in zip(*scans, strict=True)))
+    line = (np.array([[1.0, y], [9.0, y]]),)
+    both = np.concatenate([poses, poses])
+    assert blocked_arcs(lidar, poses, jax.tree.map(lambda x: x[:9], scans), line, np.ones(1)).all()
+    assert not blocked_arcs(lidar, both, scans, line, np.ones(1)).any()
 
 
 def test_a_map_without_arcs_or_scans_has_none_that_is_blocked():

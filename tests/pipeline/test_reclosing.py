@@ -1,5 +1,7 @@
 """Drives whose wheels and scans were both wrong: closed where they show places twice."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,8 @@ import pytest
 from office_drive import CONFIG, LIDAR, PARAMS, office_drive, take
 
 from jaxslam.core.se2_np import increments
+from jaxslam.mapping.map_consistency import MapConsistency
+from jaxslam.mapping.map_warnings import MapWarning
 from jaxslam.matching.revisits import Revisits
 from jaxslam.pipeline import offline, reclosing
 from jaxslam.simulation import ray_casting
@@ -47,6 +51,52 @@ def drive():
 def rmse(found, poses):
     off = found.poses[:, :2] - poses[:, :2]
     return np.sqrt(np.mean(np.sum(off**2, axis=1)))
+
+
+def consistency(contradiction, warnings=0):
+    """Of scans with this contradiction of earlier visits."""
+    found = np.array(contradiction, float)
+    steps = np.full(len(found) - 1, np.nan)
+    return MapConsistency(
+        scan=np.arange(len(found)),
+        poses=np.zeros((len(found), 3)),
+        step_contradiction=steps,
+        step_confirmation=steps,
+        visit_contradiction=found,
+        wall_distance=np.zeros(0),
+        warnings=warnings * (MapWarning(0, 1, 0.0, 0.0, ""),),
+    )
+
+
+@pytest.mark.parametrize(
+    "new, old, expected",
+    [
+        (consistency(10 * [0.0]), consistency(5 * [0.0] + 5 * [0.9]), True),
+        (consistency(9 * [0.0] + [0.9]), consistency(8 * [0.0] + 2 * [0.9]), True),
+        (consistency(5 * [0.0] + 5 * [0.9]), consistency(5 * [0.0] + 5 * [0.9]), False),
+        (consistency(10 * [0.0]), consistency(10 * [0.0]), False),
+        (consistency(10 * [0.0]), consistency(10 * [0.0], warnings=1), True),
+        (consistency(10 * [0.0], warnings=2), consistency(9 * [0.0] + [0.9], warnings=1), False),
+        # Torn apart, nothing is contradicted.
+        (consistency(2 * [0.0] + 8 * [np.nan]), consistency(5 * [0.0] + 5 * [0.9]), False),
+    ],
+)
+def test_a_map_is_better_that_contradicts_itself_less_and_compares_as_much(new, old, expected):
+    assert reclosing._is_better(new, old) == expected
+
+
+def test_notes_have_the_numbers_of_the_scans_and_name_the_saved_map():
+    result = SimpleNamespace(keyframes=np.arange(100, 150), saved_poses=np.zeros((40, 3)))
+    found = Revisits(
+        first=np.array([3, 5, 41, 42, 39, 44]),
+        second=np.array([60, 62, 70, 71, 80, 81]),
+        relative_pose=np.zeros((6, 3)),
+        group=np.array([0, 0, 1, 1, 2, 2]),
+    )
+    saved, own, both = reclosing._notes(result, found)
+    assert saved.startswith("scans 120-122 show places that the saved map showed")
+    assert own.startswith("scans 130-131 show places that scans 101-102 showed")
+    assert both.startswith("scans 140-141 show places that scans 104-104 and the saved map showed")
 
 
 @pytest.mark.slow

@@ -82,9 +82,20 @@ def test_wrong_closures_among_right_ones_are_rejected():
     assert_same(found.poses, poses, 0.3)
 
 
-def test_shapes_that_do_not_fit_are_refused():
+def test_one_pose_without_factors_stays_where_it_is():
+    none = Factors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    found = solve_rotation_first(drive()[:1], none)
+    np.testing.assert_array_equal(found.poses, drive()[:1])
+
+
+def test_factors_that_do_not_fit_are_refused():
     poses = drive()
     factors = factors_of(poses, np.array([[0, 40]]))
+    apart = Factors(*(np.delete(x, 20, axis=0)[:-1] for x in factors))
+    with pytest.raises(ValueError, match="pose 21 is not joined to the first one"):
+        solve_rotation_first(poses, apart)
+    with pytest.raises(ValueError, match="factors.relative_pose is not finite"):
+        solve_rotation_first(poses, factors._replace(relative_pose=factors.relative_pose * np.nan))
     with pytest.raises(ValueError, match=r"factors\.cov"):
         solve_rotation_first(poses, factors._replace(cov=factors.cov[:-1]))
     with pytest.raises(ValueError, match="poses"):

@@ -9,6 +9,9 @@ are sure and right, and those that are sure and wrong are counted. The particle 
 its particles are together within 0.25 m and 5 degrees (std). Steps of one drive are not
 independent, so the intervals of their shares are too narrow.
 
+With `--own_truth 1` the truth of the second half is the smoothed trajectory of the whole log
+instead of its reference, whose own errors are those of a map.
+
 `--batch` robots at once in a simulated office are then localised on all devices, and one by one.
 """
 
@@ -36,6 +39,7 @@ from experiments.localisation_drives import (
     in_own_map,
     make_drives,
     scans_of,
+    with_own_truth,
 )
 from experiments.localisation_metrics import Tracks, reliability, split, summary
 from experiments.log_folder import Log
@@ -242,20 +246,24 @@ def total_reliability(numbers: Numbers, method: str) -> list[Numbers]:
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    args = common.parse(__doc__, argv, data="", starts=200, batch=256)
+    args = common.parse(__doc__, argv, data="", starts=200, batch=256, own_truth=0)
     for flag in ("starts", "batch"):
         if getattr(args, flag) < 1:
             raise InputError(f"{getattr(args, flag)} is too small", field=f"--{flag}")
     use_cpu_devices()
     enable_caches()
     chosen = log_folder.with_reference(args.data, MAX_SCANS)
-    about = {"data": args.data, "starts": args.starts, "seed": args.seed, "batch": args.batch}
+    if args.own_truth:
+        chosen = {name: with_own_truth(log) for name, log in chosen.items()}
+    keys = ("data", "starts", "seed", "batch", "own_truth")
+    about = {key: getattr(args, key) for key in keys}
     cache = common.ResultCache(args.out / f"{NAME}_parts", about)
     found = {
         name: run_log(log, args.starts, args.seed, cache, name) for name, log in chosen.items()
     }
     batch = cache("batch", partial(localisation_batch.measure, args.batch, args.seed))
     numbers: Numbers = {"seed": args.seed, "starts": args.starts, "logs": found, "batch": batch}
+    numbers["own_truth"] = bool(args.own_truth)
     numbers["reliability"] = total_reliability(numbers, JAXSLAM)
     print(text_of(numbers))
     common.save(args.out, NAME, numbers, localisation_picture.draw)

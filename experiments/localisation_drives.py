@@ -118,6 +118,12 @@ def in_first_half(log: Log) -> MappedLog:
     )
 
 
+def with_own_truth(log: Log) -> Log:
+    """The log with its own smoothed trajectory as reference."""
+    found = log_input.run(log_input.from_laser_log(log.laser_log))
+    return log._replace(reference=(np.asarray(log.laser_log.times), np.asarray(found.poses)))
+
+
 def truth_by_nearest(reference: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """True poses (N, 3) in the frame of a map, and whether it shows what is seen there (N,).
 

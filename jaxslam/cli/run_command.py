@@ -79,8 +79,9 @@ def run(
     with the extra [graph], map.graphml; an occupancy grid as map.yaml and map.pgm, for map_server
     and `jaxslam map`; the pose graph graph.g2o, for batch optimisers; and map.npz, all that later
     sessions need of the map, for `jaxslam.load_map`. The pose of the first scan is the origin of
-    the map. A WARNING names the scans where the map contradicts itself, because the run was lost
-    there; path.png marks them.
+    the map. Where the map contradicts itself, loops are closed at places that are found again,
+    however far off, and a note names them. A WARNING names the scans where it still does, because
+    the run was lost there; path.png marks them.
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is

@@ -11,6 +11,7 @@ from jaxslam.matching.scan_agreement import (
     OUT_OF_VIEW,
     PosedScans,
     ScanComparison,
+    posed_scans,
 )
 from jaxslam.simulation.worlds import outline
 
@@ -156,6 +157,17 @@ def test_ends_of_two_scans_are_confirmed_contradicted_or_hidden(distance, first,
         assert set(state.tolist()) == {wanted} or set(state.tolist()) == {wanted, OUT_OF_VIEW}
     if CONTRADICTED in (first, second):
         np.testing.assert_allclose(np.nanmax(found.distance), abs(distance - 2.0), atol=0.05)
+
+
+@pytest.mark.parametrize("first, count", [(-np.pi, 360), (0.0, 360), (-np.pi, 90), (0.3, 180)])
+def test_a_scanner_that_sees_all_around_has_no_blind_wedge(first, count):
+    lidar = Lidar(count, first, 2 * np.pi / count, 30.0)
+    angles = lidar.angle_min + lidar.angle_increment * np.arange(count)
+    reach = np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    ranges = 3.0 / reach[None]  # of a square room, from its middle
+    posed = posed_scans(lidar, np.zeros((1, 3)), ranges, ranges > 0.0).only(np.array([0, 0]))
+    found = ScanComparison(posed).compare(np.array([0]), np.array([1]))
+    assert set(found.state.ravel().tolist()) == {CONFIRMED}
 
 
 def test_a_scan_alone_or_without_returns_says_nothing():

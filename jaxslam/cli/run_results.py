@@ -76,7 +76,11 @@ def write(
         "keyframes": len(result.keyframes),
         "landmarks": int(np.sum(confirmed(config.filter, result.belief))),
         "matches": float(np.mean(np.sum(np.asarray(result.info.used), axis=1))),
-        "closures": len(result.loop_closures.first) if result.loop_closures else 0,
+        "closures": sum(
+            len(closures.first)
+            for closures in (result.loop_closures, result.saved_closures)
+            if closures is not None
+        ),
         "map_consistency": consistency.metrics(),
     }
     several, path_length, first_row = len(context.drives) > 1, 0.0, 0

@@ -67,6 +67,9 @@ SAME = 0.5
 """Share of the ends confirmed at a place that are confirmed where the drive has it, beyond which it
 is in both."""
 
+MIN_SPAN = 1.0
+"""[m] between two places of a set, at least."""
+
 AROUND = 6.0
 """[m] driven before and after a place whose scans are compared."""
 
@@ -263,7 +266,7 @@ def _compare(
     confirmed, at = best[good], hypotheses.found.second[best[good], :2]
     gaps = at[:, None] - at[None]
     span = np.max(np.hypot(gaps[..., 0], gaps[..., 1]), initial=0.0)
-    accepted = len(confirmed) >= spec.min_places and bool(span >= spec.min_span)
+    accepted = len(confirmed) >= spec.min_places and bool(span >= MIN_SPAN)
     value = np.sum(there[good] @ [1.0, -CONTRADICTION_COST]) * len(confirmed)
     accepted &= bool(np.mean(good) >= MIN_GOOD)
     return _Comparison(confirmed, accepted, float(value))

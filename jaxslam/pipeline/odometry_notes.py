@@ -17,7 +17,8 @@ def share_out(
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Odometry (T, 3) whose leaps are shared out, its shares (T,), and a note if there are any."""
     odometry, is_share, num_leaps = share_out_leaps(odometry, scans, unknown)
-    note = f"{num_leaps} leaps after latched poses shared out over the scans before"
+    leaps = "1 leap" if num_leaps == 1 else f"{num_leaps} leaps"
+    note = f"{leaps} after latched poses shared out over the scans before"
     return odometry, is_share, (note,) if num_leaps else ()
 
 

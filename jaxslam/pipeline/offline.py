@@ -32,6 +32,7 @@ from jaxslam.pipeline.filtered import (
 from jaxslam.pipeline.online import SlamState
 from jaxslam.pipeline.pieces import Group
 from jaxslam.pipeline.results import SlamResult
+from jaxslam.pipeline.self_check import remark
 from jaxslam.pipeline.stages import Drive, KeyframeChunk
 
 
@@ -143,7 +144,9 @@ def run_slam(
             f"scans {spans} share no place with the rest that was found again: they are a map of "
             "their own",
         )
-    return main._replace(notes=notes + main.notes, other_parts=tuple(others))
+    others = [part._replace(notes=part.notes + remark(part.consistency)) for part in others]
+    notes += main.notes + remark(main.consistency)
+    return main._replace(notes=notes, other_parts=tuple(others))
 
 
 def _spans(piece: np.ndarray) -> str:

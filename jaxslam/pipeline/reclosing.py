@@ -34,6 +34,7 @@ from jaxslam.matching.revisits import Revisits, find_revisits
 from jaxslam.pipeline import online, pieces, sessions
 from jaxslam.pipeline.filtered import Filtered, Run, filter_along, result_of
 from jaxslam.pipeline.results import SlamResult
+from jaxslam.pipeline.self_check import UNEXPLAINED
 from jaxslam.pipeline.smoothing_stage import PADDING_MULTIPLE
 from jaxslam.smoothing.problem import ODOMETRY_STD_FLOOR
 from jaxslam.smoothing.rotation_first import Factors, solve_rotation_first
@@ -52,9 +53,6 @@ WRONG_STEP = 5.0
 
 LEAST_TRUST = 0.1
 """Inlier fraction, times weight of the wheels, of a step that is contradicted most."""
-
-UNEXPLAINED = 0.01
-"""Share of the scans that may contradict a map, without a warning, before places are looked for."""
 
 SHARE_COMPARED = 0.9
 """Share of the scans that were compared with other visits that still have to be, at least."""

@@ -7,6 +7,9 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.mapping.map_consistency import MapConsistency, check_map
 from jaxslam.mapping.saved_map import SavedMap
 
+UNEXPLAINED = 0.01
+"""Share of the scans that contradict a map that is fine, at most."""
+
 
 def check_poses(
     lidar: Lidar,
@@ -48,4 +51,16 @@ def check_poses(
         step_confirmation=found.step_confirmation[new[1:]][1:],
         visit_contradiction=found.visit_contradiction[new],
         warnings=warnings,
+    )
+
+
+def remark(found: MapConsistency) -> tuple[str, ...]:
+    """A note if more scans contradict a map than usual, though there is no warning."""
+    contradicts = found.scan[~found.explained]
+    if found.warnings or len(contradicts) <= UNEXPLAINED * len(found.scan):
+        return ()
+    share, first, last = len(contradicts) / len(found.scan), contradicts[0], contradicts[-1]
+    return (
+        f"{share:.1%} of the scans, between {first} and {last}, contradict the map, none of them "
+        "for long enough to warn: it may be bent there",
     )

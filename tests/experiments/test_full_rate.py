@@ -92,12 +92,9 @@ def by_odometry(monkeypatch):
 
     def run(given, callback=None):
         poses = given.odom_poses * [1.0, 1.0, 0.0]
-        return SimpleNamespace(poses=poses, notes=(), piece=np.zeros(len(poses), int))
+        return SimpleNamespace(poses=poses, notes=(), consistency=SimpleNamespace(warnings=(1,)))
 
     monkeypatch.setattr(log_input, "run", run)
-    monkeypatch.setattr(
-        full_rate, "check_map", lambda lidar, poses, scans, piece: SimpleNamespace(warnings=(1,))
-    )
 
 
 def test_rows_of_a_run_stand_beside_the_odometry(by_odometry, tmp_path):

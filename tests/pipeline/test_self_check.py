@@ -7,7 +7,7 @@ import numpy as np
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import compose
 from jaxslam.mapping.map_consistency import check_map
-from jaxslam.pipeline.self_check import check_poses
+from jaxslam.pipeline.self_check import check_poses, remark
 
 LIDAR = Lidar(num_beams=181, angle_min=-np.pi / 2, angle_increment=np.pi / 180, range_max=30.0)
 ROOM = np.array([8.0, 5.0])  # [m]
@@ -54,3 +54,15 @@ def test_what_only_the_saved_map_shows_does_not_count():
     at_rest = Scan(*(x[-1:] for x in scans))
     last = check_poses(LIDAR, crooked[-1:], at_rest, np.zeros(1, int), saved)
     assert last.metrics()["explained"] is None
+
+
+def test_more_scans_that_contradict_a_map_than_usual_are_noted():
+    poses, scans = drive()
+    fine = check_map(LIDAR, poses, scans)
+    assert remark(fine) == ()
+    contradiction = np.zeros(len(fine.scan))
+    contradiction[[3, 7]] = 0.6
+    bent = fine._replace(visit_contradiction=contradiction)
+    (note,) = remark(bent)
+    assert f"between {fine.scan[3]} and {fine.scan[7]}, contradict the map" in note
+    assert remark(bent._replace(warnings=(None,))) == ()

@@ -30,6 +30,7 @@ from jaxslam.matching.map_places import (
     consistent_sets,
     fit_transform,
     places_between,
+    span_of,
     transforms_near,
 )
 from jaxslam.matching.scan_agreement import (
@@ -103,13 +104,12 @@ def find_join(spec: JoinSpec, first: ScanMap, second: ScanMap) -> Join:
         confirmed, contradicted = compare_maps(posed_first, posed_second, near)
         value = confirmed - CONTRADICTION_COST * contradicted
         share = contradicted / max(confirmed + contradicted, 1)
-        gaps = agreeing.second[:, None, :2] - agreeing.second[None, :, :2]
         joins.append(
             Join(
                 transform=between,
                 accepted=False,
                 num_places=len(np.unique(agreeing.query)),
-                span=float(np.hypot(gaps[..., 0], gaps[..., 1]).max()),
+                span=span_of(agreeing.second),
                 contradiction=share,
                 rival=1.0,
             )

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist, pdist
 
 from jaxslam.core import trace_cache
 from jaxslam.core.batching import on_device
@@ -142,12 +143,9 @@ def places_between(spec: JoinSpec, first: ScanMap, second: ScanMap) -> FoundPlac
     for swapped, (own, other) in enumerate(((second, first), (first, second))):
         keyframes = query_keyframes(spec, own.poses)
         index = build_index(spec.place, other.lidar, other.poses, other.scans)
-        poses, scores = all_places(spec, index, own, keyframes)
-        number, candidate = np.nonzero(scores > MIN_PLACE_SCORE)
-        found, keyframe = poses[number, candidate], keyframes[number]
-        ends = found, own.poses[keyframe]
+        number, weight, found = places_of(spec, index, own, keyframes)
+        ends = found, own.poses[keyframes[number]]
         in_first, in_second = ends[::-1] if swapped else ends
-        weight = scores[number, candidate] - MIN_PLACE_SCORE
         parts.append(FoundPlaces(num_queries + number, weight, in_first, in_second))
         num_queries += len(keyframes)
     return FoundPlaces(*map(np.concatenate, zip(*parts, strict=True)))
@@ -165,10 +163,13 @@ def distance_driven(poses: np.ndarray) -> np.ndarray:
     return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
-def all_places(
+def places_of(
     spec: JoinSpec, index: PlaceIndex, own: ScanMap, keyframes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (Q, C, 3) and scores (Q, C) of the places of keyframes (Q,) in another map."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places of keyframes (Q,) in another map: numbers 0 .. Q - 1 (N,), weights (N,), poses (N, 3).
+
+    Each keyframe has several, or none; the weight is that of `FoundPlaces`.
+    """
     driven, poses, scores = distance_driven(own.poses), [], []
     for keyframe in keyframes.tolist():
         first, last = np.searchsorted(
@@ -181,7 +182,10 @@ def all_places(
         found = _look_for(spec.place, own.lidar, index, scans, on_device(around))
         poses.append(np.asarray(found[0], float))
         scores.append(np.asarray(found[1], float))
-    return np.stack(poses), np.stack(scores)
+    score = np.stack(scores)
+    number, candidate = np.nonzero(score > MIN_PLACE_SCORE)
+    weight = score[number, candidate] - MIN_PLACE_SCORE
+    return number, weight, np.stack(poses)[number, candidate]
 
 
 @partial(trace_cache.jit, static_argnames=("spec", "lidar"))
@@ -201,8 +205,7 @@ def consistent_sets(spec: JoinSpec, found: FoundPlaces) -> list[np.ndarray]:
         return []
     expected = compose(transforms[:, None], found.second[None])  # (i, j): place j by transform i
     off = relative(expected, found.first[None])
-    step = found.second[:, None, :2] - found.second[None, :, :2]
-    limit = DRIFT[0] + DRIFT[1] * np.hypot(step[..., 0], step[..., 1])
+    limit = DRIFT[0] + DRIFT[1] * cdist(found.second[:, :2], found.second[:, :2])
     agrees = (np.hypot(off[..., 0], off[..., 1]) < limit) & (np.abs(off[..., 2]) < MAX_TURN)
     by_query = np.zeros((len(transforms), found.query.max() + 1))
     for k, query in enumerate(found.query.tolist()):  # each query counts once
@@ -239,14 +242,18 @@ def fit_transform(own: np.ndarray, other: np.ndarray, weight: np.ndarray) -> np.
     return np.append(offset, heading)
 
 
+def span_of(poses: np.ndarray) -> float:
+    """[m] largest distance between two of poses (N, 3); zero without two."""
+    return float(pdist(poses[:, :2]).max(initial=0.0))
+
+
 def transforms_near(found: FoundPlaces, poses: np.ndarray) -> np.ndarray:
     """Transforms (K, 3) of a set of hypotheses at poses (K, 3) of the second map.
 
     Each is that of the places near the one that is nearest: where maps have drifted, one transform
     does not hold all over.
     """
-    step = found.second[:, None, :2] - found.second[None, :, :2]
-    near = np.hypot(step[..., 0], step[..., 1]) < NEAR
+    near = cdist(found.second[:, :2], found.second[:, :2]) < NEAR
     own = [fit_transform(found.second[k], found.first[k], found.weight[k]) for k in near]
     nearest = cKDTree(found.second[:, :2]).query(poses[:, :2])[1]
     return np.stack(own)[nearest]

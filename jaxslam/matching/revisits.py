@@ -160,10 +160,8 @@ def _hypotheses(spec: JoinSpec, scan_map: ScanMap, driven: np.ndarray) -> _Hypot
     parts = []
     for start in range(0, len(sheets), MAX_SHEETS):
         atlas = _make_atlas(spec, scan_map, sheets[start : start + MAX_SHEETS])
-        found, scores = map_places.all_places(spec, atlas.places, scan_map, keyframes)
-        query, candidate = np.nonzero(scores > map_places.MIN_PLACE_SCORE)
-        weight = scores[query, candidate] - map_places.MIN_PLACE_SCORE
-        parts.append((query, weight, *_in_drive(atlas, poses, found[query, candidate])))
+        query, weight, found = map_places.places_of(spec, atlas.places, scan_map, keyframes)
+        parts.append((query, weight, *_in_drive(atlas, poses, found)))
     query, weight, at, other = (np.concatenate(x) for x in zip(*parts, strict=True))
     own = keyframes[query]
     swap = (other > own)[:, None]  # the query is of the earlier visit
@@ -263,12 +261,13 @@ def _compare(
         before = posed.only(until & (from_second < -MIN_BETWEEN))
         as_it_is[number] = compare_maps(before, later, np.zeros(3))
     good = _agree(there) & ~(_agree(as_it_is) & (as_it_is[:, 0] > SAME * there[:, 0]))
-    confirmed, at = best[good], hypotheses.found.second[best[good], :2]
-    gaps = at[:, None] - at[None]
-    span = np.max(np.hypot(gaps[..., 0], gaps[..., 1]), initial=0.0)
-    accepted = len(confirmed) >= spec.min_places and bool(span >= MIN_SPAN)
+    confirmed = best[good]
+    accepted = (
+        len(confirmed) >= spec.min_places
+        and map_places.span_of(hypotheses.found.second[confirmed]) >= MIN_SPAN
+        and bool(np.mean(good) >= MIN_GOOD)
+    )
     value = np.sum(there[good] @ [1.0, -CONTRADICTION_COST]) * len(confirmed)
-    accepted &= bool(np.mean(good) >= MIN_GOOD)
     return _Comparison(confirmed, accepted, float(value))
 
 

@@ -11,6 +11,7 @@ from jaxslam.core.measurement import Measurement, ScanMatch
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import trajectories_as_one
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.mapping.blocked_arcs import blocked_arcs
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.matching.map_places import ScanMap
@@ -58,6 +59,13 @@ class Filtered(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
+def nothing_filtered(run: Run, start: Any, saved: SavedMap | None = None) -> Filtered:
+    """No keyframes yet, in a map of their own or in a saved one."""
+    if saved is None:
+        return Filtered(start, online.init(run.config, start))
+    return Filtered(start, sessions.resume(run.config, saved), saved)
+
+
 def filter_chunks(run: Run, filtered: Filtered, chunks: Sequence[KeyframeChunk]) -> Filtered:
     """Give chunks of keyframes to the filter."""
     for now in chunks:
@@ -93,13 +101,10 @@ def filter_along(
 
 def _moved(chunk: KeyframeChunk, motion: np.ndarray) -> KeyframeChunk:
     """The chunk as if its motion (N, 3) had been matched."""
-    measurements = chunk.chunk.measurements
-    match = measurements.scan_match
+    match = chunk.chunk.measurements.scan_match
     assert match is not None and match.expected is not None
     increment = match.increment.at[: len(motion)].set(motion.astype(match.increment.dtype))
-    match = match._replace(increment=increment, expected=increment)
-    measurements = measurements._replace(scan_match=match)
-    return chunk._replace(chunk=chunk.chunk._replace(measurements=measurements))
+    return stages.with_scan_match(chunk, match._replace(increment=increment, expected=increment))
 
 
 def _matches_of(chunk: KeyframeChunk) -> ScanMatch:
@@ -127,6 +132,18 @@ def _without_blocked(
     return without_arcs(graph, blocked), (f"{what} gone: the last scans see obstacles on {on}",)
 
 
+def smoother_input(run: Run, filtered: Filtered) -> tuple[Measurement, StepInfo, Scan]:
+    """Measurements, diagnostics and scans [K] of keyframes, those of a saved map first; NumPy."""
+    info, features, matches, numbers = stages.concatenate(list(filtered.results))
+    odometry = np.concatenate([chunk.odometry for chunk in filtered.chunks])
+    own: Any = odometry.astype(info.pose.dtype)  # NumPy, like the rest
+    measurements = Measurement(own, features, scan_match=matches)
+    scans = jax.tree.map(lambda x: x[numbers], run.scans)
+    if filtered.saved is None:
+        return measurements, info, scans
+    return sessions.with_saved_keyframes(filtered.saved, measurements, info, scans)
+
+
 def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> SlamResult:
     """The result of keyframes that were filtered, smoothed if that is asked for.
 
@@ -145,13 +162,7 @@ def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> 
     poses = online_poses
     saved_poses = None if filtered.saved is None else filtered.saved.poses
     if run.smooth:
-        own: Any = keyframe_odometry.astype(info.pose.dtype)  # NumPy, like the rest
-        measurements, diagnostics = Measurement(own, features, scan_match=matches), info
-        scans = jax.tree.map(lambda x: x[numbers], run.scans) if run.match_scans else None
-        if filtered.saved is not None and scans is not None:
-            measurements, diagnostics, scans = sessions.with_saved_keyframes(
-                filtered.saved, measurements, info, scans
-            )
+        measurements, diagnostics, scans = smoother_input(run, filtered)
         smoothed, belief, closures = smooth_result(
             config,
             run.params,
@@ -159,7 +170,7 @@ def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> 
             measurements,
             diagnostics,
             state.belief,
-            scans,
+            scans if run.match_scans else None,
             guess,
         )
         state = state._replace(belief=belief)
@@ -176,7 +187,7 @@ def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> 
     if saved_poses is not None:
         drives.insert(0, saved_poses)
     topological_map = online.topological_map(config, state, trajectories_as_one(drives))
-    if run.smooth and len(drives) > 1 and scans is not None:
+    if run.smooth and len(drives) > 1:
         topological_map, gone = _without_blocked(config, topological_map, smoothed, scans)
         notes += gone
     if matched.matches is not None and config.scan_matching.use_odometry:

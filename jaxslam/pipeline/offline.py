@@ -26,6 +26,7 @@ from jaxslam.pipeline.filtered import (
     Run,
     filter_along,
     filter_chunks,
+    nothing_filtered,
     result_of,
     scan_map,
 )
@@ -180,7 +181,7 @@ def _several_pieces(
     for chunk in later:
         if chunk.piece not in alone:
             start = arguments.as_start(None)
-            alone[chunk.piece] = Filtered(start, online.init(run.config, start))
+            alone[chunk.piece] = nothing_filtered(run, start)
         alone[chunk.piece] = filter_chunks(quiet, alone[chunk.piece], [chunk])
     found = {}
     for number, piece in alone.items():
@@ -189,7 +190,7 @@ def _several_pieces(
     if saved is not None:
         maps[pieces.SAVED] = sessions.scan_map(saved)
         start = arguments.as_start(saved.poses[0])
-        alone[pieces.SAVED] = Filtered(start, sessions.resume(run.config, saved), saved)
+        alone[pieces.SAVED] = nothing_filtered(run, start, saved)
     results = []
     firsts = {number: piece.chunks[0] for number, piece in alone.items() if piece.chunks}
     across = {k: x.across_break for k, x in firsts.items() if x.across_break is not None}

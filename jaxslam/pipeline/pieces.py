@@ -144,8 +144,7 @@ def after_gap(chunk: KeyframeChunk, rows: np.ndarray, increments: np.ndarray) ->
         rows: (N,) int indices of these keyframes in the chunk.
         increments: (N, 3) [m, m, rad] motion to them from the keyframe before, of `JOIN_STD`.
     """
-    measurements = chunk.chunk.measurements
-    match = measurements.scan_match
+    match = chunk.chunk.measurements.scan_match
     assert match is not None and match.expected is not None and match.expected_variance is not None
 
     def put(held: Any, value: Any) -> Any:
@@ -157,5 +156,4 @@ def after_gap(chunk: KeyframeChunk, rows: np.ndarray, increments: np.ndarray) ->
         expected=put(match.expected, increments),
         expected_variance=put(match.expected_variance, np.square(JOIN_STD)),
     )
-    measurements = measurements._replace(scan_match=match)
-    return chunk._replace(chunk=chunk.chunk._replace(measurements=measurements))
+    return stages.with_scan_match(chunk, match)

@@ -16,27 +16,26 @@ is smoothed again, with the measurements as they were except for these steps. Wh
 taken only if it contradicts itself less.
 """
 
-from functools import partial
-
-import jax
 import numpy as np
 
-from jaxslam.core import trace_cache
-from jaxslam.core.batching import on_device, pad_to
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import increments, wrap_angle
-from jaxslam.core.types import Array
-from jaxslam.filtering.noise import NoiseParams, motion_estimate
 from jaxslam.mapping.map_consistency import MapConsistency
 from jaxslam.matching.map_places import ScanMap
 from jaxslam.matching.revisits import Revisits, find_revisits
-from jaxslam.pipeline import online, pieces, sessions
-from jaxslam.pipeline.filtered import Filtered, Run, filter_along, result_of
+from jaxslam.pipeline import pieces
+from jaxslam.pipeline.filtered import (
+    Filtered,
+    Run,
+    filter_along,
+    nothing_filtered,
+    result_of,
+    smoother_input,
+)
 from jaxslam.pipeline.results import SlamResult
-from jaxslam.pipeline.self_check import UNEXPLAINED
-from jaxslam.pipeline.smoothing_stage import PADDING_MULTIPLE
-from jaxslam.smoothing.problem import ODOMETRY_STD_FLOOR
+from jaxslam.pipeline.self_check import is_contradicted
+from jaxslam.pipeline.smoothing_stage import padded_problem
+from jaxslam.smoothing.problem import SmoothingProblem
 from jaxslam.smoothing.rotation_first import Factors, solve_rotation_first
 
 MAX_ROUNDS = 3
@@ -76,15 +75,26 @@ def close_again(run: Run, filtered: Filtered, result: SlamResult) -> tuple[Filte
         return filtered, result
     for _ in range(MAX_ROUNDS):
         before = result.consistency
-        if not before.warnings and not np.sum(~before.explained) > UNEXPLAINED * len(before.scan):
+        if not is_contradicted(before):
             break
-        poses, scans, measurements = _whole_drive(run, filtered, result)
+        measurements, _, scans = smoother_input(run, filtered)
+        poses = result.poses[result.keyframes]
+        if result.saved_poses is not None:
+            poses = np.concatenate([result.saved_poses, poses])
         found = find_revisits(run.config.joining, ScanMap(run.config.frontend.lidar, poses, scans))
         is_new = found.second >= len(poses) - len(result.keyframes)
         found = Revisits(*(x[is_new] for x in found))
         if not len(found.first):
             break
-        poses, wrong = _solve(run, result, poses, measurements, found)
+        problem = padded_problem(
+            run.config.filter.untrusted_inflation,
+            run.params,
+            filtered.start,
+            measurements,
+            np.full(measurements.features.kind.shape, -1, np.int32),
+            poses,
+        )[0]
+        poses, wrong = _solve(problem, result, poses, measurements, found)
         again = _filter_again(run, filtered, result, poses, wrong)
         again = again._replace(notes=(*filtered.notes, *_notes(result, found)))
         closed = result_of(run, again, poses)
@@ -112,32 +122,17 @@ def _is_better(new: MapConsistency, old: MapConsistency) -> bool:
     return is_clear or (len(new.warnings) < len(old.warnings) and unexplained[0] <= unexplained[1])
 
 
-def _whole_drive(
-    run: Run, filtered: Filtered, result: SlamResult
-) -> tuple[np.ndarray, Scan, Measurement]:
-    """Poses (K, 3), scans [K] and measurements [K] of all keyframes, those of a saved map first."""
-    scans = jax.tree.map(lambda x: x[result.keyframes], run.scans)
-    poses = result.poses[result.keyframes]
-    assert result.odometry is not None
-    odometry = result.odometry.astype(np.asarray(result.info.pose).dtype)
-    measurements = Measurement(odometry, result.features, scan_match=result.scan_matches)  # type: ignore[arg-type]
-    if filtered.saved is not None and result.saved_poses is not None:
-        measurements, _, scans = sessions.with_saved_keyframes(
-            filtered.saved, measurements, result.info, scans
-        )
-        poses = np.concatenate([result.saved_poses, poses])
-    return poses, scans, measurements
-
-
 def _solve(
-    run: Run, result: SlamResult, poses: np.ndarray, measurements: Measurement, found: Revisits
+    problem: SmoothingProblem,
+    result: SlamResult,
+    poses: np.ndarray,
+    measurements: Measurement,
+    found: Revisits,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (K, 3) by motion, loop closures, and places found again; and wrong steps (K,)."""
     count = len(poses)
-    padded = pad_to(measurements, to=count + -count % PADDING_MULTIPLE)
-    motion = _motion(run.params, on_device(padded))
+    motion = problem.odometry, problem.odometry_cov
     increment, matched_cov = (np.asarray(x, float)[:count] for x in motion)
-    matched_cov = matched_cov + ODOMETRY_STD_FLOOR**2 * np.eye(3)
     cov = matched_cov * _uncertainty(measurements)[:, None, None] ** 2
     num_saved = count - len(result.keyframes)
     steps, places = np.arange(1, count), len(found.first)
@@ -185,22 +180,12 @@ def _uncertainty(measurements: Measurement) -> np.ndarray:
     return np.where(matched, 1.0 / trust.clip(LEAST_TRUST, 1.0), 1.0)
 
 
-@partial(trace_cache.jit)
-def _motion(params: NoiseParams, measurements: Measurement) -> tuple[Array, Array]:
-    """Increments (K, 3) of wheels and scans together, and their covariances (K, 3, 3)."""
-    return jax.vmap(motion_estimate, in_axes=(None, 0))(params, measurements)
-
-
 def _filter_again(
     run: Run, filtered: Filtered, result: SlamResult, poses: np.ndarray, wrong: np.ndarray
 ) -> Filtered:
     """The keyframes filtered along poses (K, 3), measured as before except at wrong steps (K,)."""
     num_saved = len(poses) - len(result.keyframes)
     motion, wrong = increments(poses)[num_saved:], wrong[num_saved:]
-    if filtered.saved is not None:
-        state = sessions.resume(run.config, filtered.saved)
-    else:
-        state = online.init(run.config, filtered.start)
     chunks, end = [], 0
     for chunk in filtered.chunks:
         start, end = end, end + len(chunk.keyframes)
@@ -208,7 +193,7 @@ def _filter_again(
         chunks.append(
             pieces.after_gap(chunk, rows, motion[start:end][rows]) if rows.size else chunk
         )
-    again = Filtered(filtered.start, state, filtered.saved)
+    again = nothing_filtered(run, filtered.start, filtered.saved)
     again = filter_along(run._replace(callback=None), again, chunks, motion)
     return again._replace(motion=motion)
 

@@ -54,11 +54,16 @@ def check_poses(
     )
 
 
+def is_contradicted(found: MapConsistency) -> bool:
+    """Whether the scans contradict a map more than one that is fine."""
+    return bool(found.warnings) or np.sum(~found.explained) > UNEXPLAINED * len(found.scan)
+
+
 def remark(found: MapConsistency) -> tuple[str, ...]:
     """A note if more scans contradict a map than usual, though there is no warning."""
-    contradicts = found.scan[~found.explained]
-    if found.warnings or len(contradicts) <= UNEXPLAINED * len(found.scan):
+    if found.warnings or not is_contradicted(found):
         return ()
+    contradicts = found.scan[~found.explained]
     share, first, last = len(contradicts) / len(found.scan), contradicts[0], contradicts[-1]
     return (
         f"{share:.1%} of the scans, between {first} and {last}, contradict the map, none of them "

@@ -7,7 +7,7 @@ from jaxslam.core import trace_cache
 from jaxslam.core.batching import pad_to
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import Array
+from jaxslam.core.types import AnyArray, Array
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
@@ -72,7 +72,7 @@ def smooth_result(
     numbered = numbering.number_landmarks(
         info.id, initial, measurements.features, capacity=capacity
     )
-    problem, initial = _padded_problem(
+    problem, initial = padded_problem(
         config.filter.untrusted_inflation,
         params,
         start,
@@ -138,12 +138,12 @@ def _padded(count: int) -> int:
     return (count // PADDING_MULTIPLE + 1) * PADDING_MULTIPLE
 
 
-def _padded_problem(
+def padded_problem(
     untrusted_inflation: float,
     params: NoiseParams,
     start: Array,
     measurements: Measurement,
-    landmark_index: Array,
+    landmark_index: AnyArray,
     poses: np.ndarray,
 ) -> tuple[SmoothingProblem, np.ndarray]:
     """Smoothing problem and guess (P, 3), padded by steps without motion and measurements.

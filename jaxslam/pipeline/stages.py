@@ -73,6 +73,12 @@ class KeyframeChunk(NamedTuple):
     across_break: np.ndarray | None = None
 
 
+def with_scan_match(chunk: KeyframeChunk, match: ScanMatch) -> KeyframeChunk:
+    """The chunk with other scan matches [CHUNK] for the filter."""
+    measurements = chunk.chunk.measurements._replace(scan_match=match)
+    return chunk._replace(chunk=chunk.chunk._replace(measurements=measurements))
+
+
 class Drive(NamedTuple):
     """What is matched: T scans with odometry, NumPy.
 

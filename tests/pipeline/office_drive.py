@@ -18,7 +18,12 @@ def office_drive(step=0.25):
     """Poses (T, 3) on the drive through the office, and its scans."""
     path = path_following.densify(worlds.waypoints("office"))
     poses = path_following.poses_along(path, step)
-    world, keys = worlds.named("office"), jax.random.split(jax.random.key(3), len(poses))
+    return poses, scans_along(worlds.named("office"), poses, 3)
+
+
+def scans_along(world, poses, seed):
+    """Scans [T] of a world from poses (T, 3), with noise."""
+    keys = jax.random.split(jax.random.key(seed), len(poses))
 
     @jax.jit
     def cast(keys, poses):
@@ -27,7 +32,7 @@ def office_drive(step=0.25):
 
         return jax.vmap(scan)(keys, poses)
 
-    return poses, jax.tree.map(np.asarray, cast(keys, jnp.asarray(poses)))
+    return jax.tree.map(np.asarray, cast(keys, jnp.asarray(poses)))
 
 
 def take(scans, index):

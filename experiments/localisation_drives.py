@@ -77,15 +77,7 @@ def in_own_map(log: Log) -> MappedLog:
     given = log_input.from_laser_log(log.laser_log)
     poses, place_map = _map_of(given)
     everywhere = np.isfinite(poses[:, 0])
-    return MappedLog(
-        given.config.frontend.lidar,
-        jax.tree.map(np.asarray, given.scans),
-        _matched(given),
-        place_map,
-        poses,
-        everywhere,
-        everywhere,
-    )
+    return _mapped(given, place_map, poses, everywhere, everywhere)
 
 
 def in_first_half(log: Log) -> MappedLog:
@@ -107,15 +99,20 @@ def in_first_half(log: Log) -> MappedLog:
     reference = np.full((len(given.increments), 3), np.nan)
     reference[pairs[:, 0]] = log.reference[1][pairs[:, 1]]
     truth, inside = truth_by_nearest(reference, poses)
-    return MappedLog(
-        given.config.frontend.lidar,
-        jax.tree.map(np.asarray, given.scans),
-        _matched(given),
-        place_map,
-        truth,
-        inside,
-        np.arange(len(reference)) < count,
-    )
+    in_map = np.arange(len(reference)) < count
+    return _mapped(given, place_map, truth, inside, in_map)
+
+
+def _mapped(
+    given: LogInput,
+    place_map: PlaceMap,
+    truth: np.ndarray,
+    inside: np.ndarray,
+    in_map: np.ndarray,
+) -> MappedLog:
+    """The record of a log in a map; the last three are those of `MappedLog`."""
+    scans, lidar = jax.tree.map(np.asarray, given.scans), given.config.frontend.lidar
+    return MappedLog(lidar, scans, _matched(given), place_map, truth, inside, in_map)
 
 
 def with_own_truth(log: Log) -> Log:

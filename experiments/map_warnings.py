@@ -6,7 +6,7 @@ latter those with one above 0.5 m lost; the others do not count. Recorded logs `
 folder `--data` are damaged likewise if their reference `NAME.reference.tum` lies beside them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain, cycle, islice
 from pathlib import Path
 
@@ -62,19 +62,40 @@ def examine(drive: Drive, damage: Damage, rng: np.random.Generator) -> Numbers:
     }
 
 
-def compute(seed: int, num_drives: int, data: Path | None) -> Numbers:
-    """Errors and warnings of all trajectories, and the shares that were warned of."""
-    pairs = zip(cycle(FINE.values()), cycle(LOST.values()), strict=False)
-    damages, cases = list(islice(chain.from_iterable(pairs), num_drives)), []
-    for k, damage in enumerate(tqdm(damages, unit="drive", leave=False)):
+def examine_all(
+    examine: Callable[[Drive, Damage, np.random.Generator], Numbers],
+    simulated: list[Damage],
+    recorded: list[Damage],
+    seed: int,
+    data: Path | None,
+) -> list[Numbers]:
+    """Cases of simulated drives, one for each damage, and of the recorded ones by each damage.
+
+    Args:
+        examine: Numbers of a damaged drive.
+        simulated: Damage of each simulated drive.
+        recorded: Damages of each recorded drive, `TIMES_EACH` times.
+        seed: Of drives and damages.
+        data: Folder of the recorded logs; None for none.
+    """
+    cases = []
+    for k, damage in enumerate(tqdm(simulated, unit="drive", leave=False)):
         number = 1_000_000 * (seed + 1) + k
         drive = damaged_drives.simulate(number)
         case = examine(drive, damage, np.random.default_rng([seed, k]))
         cases.append({"drive": SIMULATED, "number": number} | case)
     for name, drive in recorded_drives(data) if data else ():
-        for k, damage in enumerate([*FINE.values(), *LOST.values()] * TIMES_EACH):
+        for k, damage in enumerate(tqdm(recorded * TIMES_EACH, desc=name, leave=False)):
             case = examine(drive, damage, np.random.default_rng([seed, k]))
             cases.append({"drive": name, "number": k} | case)
+    return cases
+
+
+def compute(seed: int, num_drives: int, data: Path | None) -> Numbers:
+    """Errors and warnings of all trajectories, and the shares that were warned of."""
+    pairs = zip(cycle(FINE.values()), cycle(LOST.values()), strict=False)
+    damages = list(islice(chain.from_iterable(pairs), num_drives))
+    cases = examine_all(examine, damages, [*FINE.values(), *LOST.values()], seed, data)
     drives = sorted({case["drive"] for case in cases})
     return {
         "seed": seed,
@@ -113,9 +134,9 @@ def draw(numbers: Numbers, path: Path) -> None:
     for kind, colour in KINDS.items():
         rows = [(name, shares[kind]) for name, shares in numbers["shares"].items()]
         damages = LOST if kind == "lost" else FINE
-        _draw_shares(axes[0, 0], rows, colour)
+        draw_shares(axes[0, 0], rows, colour)
         rows = [(name, numbers["by_damage"][name]) for name in damages]
-        _draw_shares(axes[0, 1], rows, colour)
+        draw_shares(axes[0, 1], rows, colour)
     for axis in axes[0]:
         axis.set(xlim=(-0.02, 1.02), xlabel="share with a warning, 95 % interval")
         axis.invert_yaxis()
@@ -126,7 +147,7 @@ def draw(numbers: Numbers, path: Path) -> None:
     figure.savefig(path)
 
 
-def _draw_shares(axis, rows: list[tuple[str, Numbers]], colour: str) -> None:
+def draw_shares(axis, rows: list[tuple[str, Numbers]], colour: str) -> None:
     """Draw the share and its interval for each name."""
     for name, share in rows:
         if share["cases"]:

@@ -7,16 +7,15 @@ them. A pair of scans is right if their relative pose is within 0.5 m and 10 deg
 one. A trajectory that damage has left nearly right, or on which nothing can be found, counts too.
 """
 
-from itertools import chain
+from itertools import chain, cycle, islice
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments import common, damaged_drives
 from experiments.common import Numbers
 from experiments.damaged_drives import FINE, LOST, Damage, Drive
-from experiments.map_warnings import SIMULATED, TIMES_EACH, recorded_drives, wilson_interval
+from experiments.map_warnings import draw_shares, examine_all, wilson_interval
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import increments, motion_size, relative
 from jaxslam.matching.map_places import JoinSpec, ScanMap
@@ -50,18 +49,9 @@ def examine(drive: Drive, damage: Damage, rng: np.random.Generator) -> Numbers:
 
 def compute(seed: int, num_drives: int, data: Path | None) -> Numbers:
     """Cases of all trajectories, and sums by damage."""
-    cases = []
-    for k in tqdm(range(num_drives), unit="drive", leave=False):
-        damage = [*DAMAGES.values()][k % len(DAMAGES)]
-        number = 1_000_000 * (seed + 1) + k
-        drive = damaged_drives.simulate(number)
-        case = examine(drive, damage, np.random.default_rng([seed, k]))
-        cases.append({"drive": SIMULATED, "number": number} | case)
-    for name, drive in recorded_drives(data) if data else ():
-        damages = list(chain.from_iterable([DAMAGES.values()] * TIMES_EACH))
-        for k, damage in enumerate(tqdm(damages, desc=name, unit="drive", leave=False)):
-            case = examine(drive, damage, np.random.default_rng([seed, k]))
-            cases.append({"drive": name, "number": k} | case)
+    damages = [*DAMAGES.values()]
+    simulated = list(islice(cycle(damages), num_drives))
+    cases = examine_all(examine, simulated, damages, seed, data)
     names = list(dict.fromkeys(case["drive"] for case in cases))
     return {
         "seed": seed,
@@ -77,17 +67,19 @@ def total(cases: list[Numbers], **wanted: str) -> Numbers:
     found = sum(case["right"] + case["wrong"] > 0 for case in some)
     low, high = wilson_interval(found, len(some))
     counts = {key: sum(case[key] for case in some) for key in ("right", "wrong", "wrong_sets")}
-    return {"cases": len(some), "found": found, "low": low, "high": high} | counts
+    share = found / len(some) if some else None
+    found_in = {"cases": len(some), "found": found, "share": share, "low": low, "high": high}
+    return found_in | counts
 
 
 def draw(numbers: Numbers, path: Path) -> None:
     """Draw the share of trajectories on which places were found, and the wrong ones, by damage."""
     figure, axes = common.canvas(9.0, 4.0, 1, 2)
     share, pairs = axes[0]
-    for name, row in numbers["by_damage"].items():
+    rows = list(numbers["by_damage"].items())
+    draw_shares(share, rows, common.BLUE)
+    for name, row in rows:
         if row["cases"]:
-            share.plot([row["low"], row["high"]], [name, name], color=common.BLUE)
-            share.plot(row["found"] / row["cases"], name, "o", color=common.BLUE)
             pairs.barh(name, row["right"], color=common.BLUE)
             pairs.barh(name, row["wrong"], left=row["right"], color=common.ORANGE)
     share.set(xlim=(-0.02, 1.02), xlabel="share of trajectories with places found, 95 % interval")

@@ -43,6 +43,8 @@ class TopologicalMap(NamedTuple):
         arc_lines: A polylines (n >= 2, 2) [m], from the first end of the arc to the second.
         frontiers: F polylines (n >= 2, 2) [m], from a node to where the field of view ended.
         frontier_node: (F,) int index of that node.
+        frontier_id: (F,) int ids of the open ends, which count with those of the nodes; empty where
+            they have none.
     """
 
     id: np.ndarray
@@ -55,6 +57,7 @@ class TopologicalMap(NamedTuple):
     arc_lines: tuple[np.ndarray, ...]
     frontiers: tuple[np.ndarray, ...] = ()
     frontier_node: np.ndarray = np.zeros(0, int)
+    frontier_id: np.ndarray = np.zeros(0, int)
 
 
 def without_arcs(graph: TopologicalMap, gone: np.ndarray) -> TopologicalMap:

@@ -10,7 +10,8 @@ stored otherwise, so that the file is small and holds nothing that could contrad
 | `topological_map.arc_lines`, `.frontiers` | points of all polylines, and how many each has |
 
 Letters are those of `SavedMap`; U numbers are in the upper triangle of (2 L, 2 L). The topological
-map has N nodes, E arcs of P points in all, and F frontiers of Q points in all.
+map has N nodes, E arcs of P points in all, and F frontiers of Q points in all; G is F, or 0 where
+they have no ids.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -80,8 +81,9 @@ LAYOUT: Mapping[str, tuple[str, tuple[int | str, ...]]] = {
     "topological_map.frontiers.size": ("int64", ("F",)),
     "topological_map.frontiers.points": ("float64", ("Q", 2)),
     "topological_map.frontier_node": ("int64", ("F",)),
+    "topological_map.frontier_id": ("int64", ("G",)),
 }
-OPTIONAL = ("params.scan_match_std_scale",)
+OPTIONAL = ("params.scan_match_std_scale", "topological_map.frontier_id")
 _UNMEASURED = ("topological_map.arc_clearance",)  # NaN where an arc was driven, not observed
 
 _DERIVED: Mapping[str, Callable[[int], int]] = {
@@ -122,7 +124,7 @@ def unpack(arrays: Arrays) -> SavedMap:
     graph = {
         name: arrays[f"topological_map.{name}"]
         for name in TopologicalMap._fields
-        if name not in ("arc_lines", "frontiers")
+        if f"topological_map.{name}" in arrays
     }
     return SavedMap(
         lidar=lidar,
@@ -220,7 +222,9 @@ def _rules(arrays: Arrays) -> Iterator[tuple[str, Any, str]]:
     yield "arcs.ends", (ends >= [0, -1]).all(), "is no pair of landmark ids"
     nodes = arrays["topological_map.id"]
     yield "topological_map.id", len(np.unique(nodes)) == len(nodes), "an id occurs twice"
-    yield "topological_map.id", np.isin(nodes, ids).all(), "a node is no landmark of belief.id"
+    own = np.concatenate([nodes, arrays.get("topological_map.frontier_id", nodes[:0])])
+    known = ((own >= 0) & (own < arrays["belief.next_id"])).all()
+    yield "topological_map.id", known, "an id is negative, or not below belief.next_id"
     kinds = np.isin(arrays["topological_map.kind"], (JUNCTION, CORNER)).all()
     yield "topological_map.kind", kinds, "is none of the kinds of node"
     for name in ("topological_map.arc_ends", "topological_map.frontier_node"):

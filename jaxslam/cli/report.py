@@ -22,7 +22,6 @@ from jaxslam.io.geojson import KINDS, Arc, Node
 from jaxslam.io.output import write_json, write_text
 from jaxslam.localisation.config import LocaliseInfo
 from jaxslam.mapping import pose_graph
-from jaxslam.mapping.occupancy import occupancy_map
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.results import SlamResult
@@ -30,8 +29,6 @@ from jaxslam.pipeline.saving import to_saved_map
 from jaxslam.simulation.worlds import World
 from jaxslam.tuning.fitting import TuneResult
 from jaxslam.tuning.parameters import param_names
-
-MAP_RESOLUTION = 0.05  # [m] resolution of the occupancy grid
 
 
 def write_results(
@@ -80,8 +77,8 @@ def write_maps(
     """
     poses = result.poses[result.keyframes]
     kept = to_saved_map(config, params, result, times, scans, saved_map)
-    grid = occupancy_map(config.frontend.lidar, kept.poses, kept.scans, resolution=MAP_RESOLUTION)
-    ros_map.write(out_dir / "map.yaml", grid)
+    if result.occupancy is not None:
+        ros_map.write(out_dir / "map.yaml", result.occupancy)
     graph = pose_graph.build_pose_graph(
         config.filter,
         params,

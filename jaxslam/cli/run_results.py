@@ -123,7 +123,7 @@ def write(
     saved, old = context.saved_map, context.annotated_map
     if result.saved_poses is None:  # a map of its own
         saved, old = None, None
-    next_id = int(result.belief.next_id)
+    next_id = max(int(result.belief.next_id), result.next_id)
     report.write_results(out_dir, numbers, result.topological_map, old, next_id)
     measurements = Measurement(
         jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches

@@ -41,6 +41,8 @@ class TopologicalMap(NamedTuple):
         arc_clearance: (A,) [m] smallest distance to an obstacle along each arc; NaN for an arc
             that was driven but not observed.
         arc_lines: A polylines (n >= 2, 2) [m], from the first end of the arc to the second.
+        arc_filled: (A,) bool, arcs through open space that are no branches of a Voronoi diagram;
+            empty where there are none.
         frontiers: F polylines (n >= 2, 2) [m], from a node to where the field of view ended.
         frontier_node: (F,) int index of that node.
         frontier_id: (F,) int ids of the open ends, which count with those of the nodes; empty where
@@ -55,6 +57,7 @@ class TopologicalMap(NamedTuple):
     arc_length: np.ndarray
     arc_clearance: np.ndarray
     arc_lines: tuple[np.ndarray, ...]
+    arc_filled: np.ndarray = np.zeros(0, bool)
     frontiers: tuple[np.ndarray, ...] = ()
     frontier_node: np.ndarray = np.zeros(0, int)
     frontier_id: np.ndarray = np.zeros(0, int)
@@ -68,4 +71,5 @@ def without_arcs(graph: TopologicalMap, gone: np.ndarray) -> TopologicalMap:
         arc_length=graph.arc_length[kept],
         arc_clearance=graph.arc_clearance[kept],
         arc_lines=tuple(graph.arc_lines[k] for k in kept.tolist()),
+        arc_filled=graph.arc_filled[kept] if len(graph.arc_filled) else graph.arc_filled,
     )

@@ -10,8 +10,8 @@ stored otherwise, so that the file is small and holds nothing that could contrad
 | `topological_map.arc_lines`, `.frontiers` | points of all polylines, and how many each has |
 
 Letters are those of `SavedMap`; U numbers are in the upper triangle of (2 L, 2 L). The topological
-map has N nodes, E arcs of P points in all, and F frontiers of Q points in all; G is F, or 0 where
-they have no ids.
+map has N nodes, E arcs of P points in all, and F frontiers of Q points in all; G is F and B is E,
+or they are 0.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -78,12 +78,17 @@ LAYOUT: Mapping[str, tuple[str, tuple[int | str, ...]]] = {
     "topological_map.arc_clearance": ("float64", ("E",)),
     "topological_map.arc_lines.size": ("int64", ("E",)),
     "topological_map.arc_lines.points": ("float64", ("P", 2)),
+    "topological_map.arc_filled": ("bool", ("B",)),
     "topological_map.frontiers.size": ("int64", ("F",)),
     "topological_map.frontiers.points": ("float64", ("Q", 2)),
     "topological_map.frontier_node": ("int64", ("F",)),
     "topological_map.frontier_id": ("int64", ("G",)),
 }
-OPTIONAL = ("params.scan_match_std_scale", "topological_map.frontier_id")
+OPTIONAL = (
+    "params.scan_match_std_scale",
+    "topological_map.arc_filled",
+    "topological_map.frontier_id",
+)
 _UNMEASURED = ("topological_map.arc_clearance",)  # NaN where an arc was driven, not observed
 
 _DERIVED: Mapping[str, Callable[[int], int]] = {
@@ -221,8 +226,8 @@ def _rules(arrays: Arrays) -> Iterator[tuple[str, Any, str]]:
     ends = arrays["arcs.ends"]
     yield "arcs.ends", (ends >= [0, -1]).all(), "is no pair of landmark ids"
     nodes = arrays["topological_map.id"]
-    yield "topological_map.id", len(np.unique(nodes)) == len(nodes), "an id occurs twice"
     own = np.concatenate([nodes, arrays.get("topological_map.frontier_id", nodes[:0])])
+    yield "topological_map.id", len(np.unique(own)) == len(own), "an id occurs twice"
     known = ((own >= 0) & (own < arrays["belief.next_id"])).all()
     yield "topological_map.id", known, "an id is negative, or not below belief.next_id"
     kinds = np.isin(arrays["topological_map.kind"], (JUNCTION, CORNER)).all()
@@ -230,6 +235,10 @@ def _rules(arrays: Arrays) -> Iterator[tuple[str, Any, str]]:
     for name in ("topological_map.arc_ends", "topological_map.frontier_node"):
         index = arrays[name]
         yield name, ((index >= 0) & (index < len(nodes))).all(), "is no index of a node"
+    for part, whole in (("arc_filled", "arc_length"), ("frontier_id", "frontier_node")):
+        name, wanted = f"topological_map.{part}", len(arrays[f"topological_map.{whole}"])
+        given = len(arrays.get(name, ()))
+        yield name, given in (0, wanted), f"has {given} entries, not {wanted} or none"
     for name in ("topological_map.arc_lines", "topological_map.frontiers"):
         size, points = arrays[f"{name}.size"], arrays[f"{name}.points"]
         fits = ((size >= 2) & (size <= len(points))).all() and size.sum() == len(points)

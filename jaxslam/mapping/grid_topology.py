@@ -8,7 +8,7 @@ Two nodes may be joined by several arcs, and a ring without a junction is one no
        (`cell_graph_cleanup`) -> polylines in the map frame
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxslam.mapping import medial_axis
 from jaxslam.mapping.cell_graph import CellGraph, trace_cells
 from jaxslam.mapping.cell_graph_cleanup import clean_up
 from jaxslam.mapping.medial_axis import FreeConfigurations
+from jaxslam.mapping.plane_graph import Line, PlaneGraph
 
 # Obstacles seen under a larger angle make dead ends; corners do not.
 DEAD_END_ANGLE = np.radians(120.0)
@@ -97,13 +98,7 @@ def extract_topology(
         raise ValueError(f"has no free space for a robot with robot_radius = {robot_radius:g} m")
     count = 1 if min_region_area is None else max(1, int(np.sum(areas >= min_region_area)))
     chosen = (space.region > 0) & (space.region <= count)
-    wall = ndimage.binary_dilation(occupied, structure=np.ones((3, 3)), iterations=UNKNOWN_MARGIN)
-    anchors = medial_axis.between_walls(space, wall, angle=DEAD_END_ANGLE) & chosen
-    callback(STAGES[1])
-    cells = medial_axis.medial_cells(space, chosen, anchors)
-    callback(STAGES[2])
-    cell_graph = trace_cells(cells, space.distance)
-    clean_up(cell_graph, space.distance)
+    cell_graph = trace_medial_axis(space, occupied, chosen, callback)
     graph = _to_map(cell_graph, space, resolution, origin)
     return GridTopology(graph, count, float(areas[:count].sum()), float(areas[count:].sum()))
 
@@ -121,6 +116,56 @@ def _check_sizes(
     ):
         if not 0.0 <= size < np.inf:
             raise ValueError(f"{name} is {size}, not a number of {unit} >= 0")
+
+
+def trace_medial_axis(
+    space: FreeConfigurations,
+    occupied: np.ndarray,
+    chosen: np.ndarray,
+    callback: Callable[[str], object] = str,
+) -> CellGraph:
+    """The medial cells of some regions as a graph, cleaned up.
+
+    Args:
+        space: Free configurations.
+        occupied: (H, W) bool.
+        chosen: (H, W) bool, the cells of the regions.
+        callback: As of `extract_topology`; called with the last two of the `STAGES`.
+    """
+    wall = ndimage.binary_dilation(occupied, structure=np.ones((3, 3)), iterations=UNKNOWN_MARGIN)
+    anchors = medial_axis.between_walls(space, wall, angle=DEAD_END_ANGLE) & chosen
+    callback(STAGES[1])
+    cells = medial_axis.medial_cells(space, chosen, anchors)
+    callback(STAGES[2])
+    cell_graph = trace_cells(cells, space.distance)
+    clean_up(cell_graph, space.distance)
+    return cell_graph
+
+
+def to_plane(cell_graph: CellGraph, resolution: float, corner: np.ndarray) -> PlaneGraph:
+    """The graph in metres; `corner` (2,) [m] is that of cell [0, 0], whose axes stay."""
+    index = {node: n for n, node in enumerate(cell_graph.nodes)}
+    cells = np.array(list(cell_graph.nodes.values())).reshape(-1, 2)
+    lines = [
+        Line(index[start], index[end], (arc.line + 0.5) * resolution + corner, True)
+        for arc in cell_graph.arcs.values()
+        for start, end in (arc.ends,)
+    ]
+    return PlaneGraph((cells + 0.5) * resolution + corner, lines)
+
+
+def line_clearances(
+    lines: Sequence[np.ndarray], space: FreeConfigurations, resolution: float, corner: np.ndarray
+) -> np.ndarray:
+    """Smallest distance (A,) [m] from polylines (n, 2) [m] to the edge of an obstacle."""
+    return np.array(
+        [
+            resolution
+            * _smallest_clearance((line - corner) / resolution - 0.5, space.nearest_obstacle)
+            for line in lines
+        ],
+        float,
+    )
 
 
 def _to_map(

@@ -61,16 +61,22 @@ def free_space(
     return free | filled[island]
 
 
-def free_configurations(free: np.ndarray, *, clearance: float) -> FreeConfigurations:
+def free_configurations(
+    free: np.ndarray, *, clearance: float, also_free: np.ndarray | None = None
+) -> FreeConfigurations:
     """Regions of free cells in which a disc-shaped robot fits.
 
     Args:
         free: (H, W) bool; what lies beyond the grid is not free.
         clearance: [cells] radius of the robot.
+        also_free: (H, W) bool, cells of `free` where the robot fits, as it was there.
     """
     to_centre, foot = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
     to_edge = to_centre[1:-1, 1:-1] - 0.5
-    region, count = ndimage.label(to_edge >= clearance, structure=_EIGHT)
+    fits = to_edge >= clearance
+    if also_free is not None:
+        fits |= also_free
+    region, count = ndimage.label(fits, structure=_EIGHT)
     sizes = np.bincount(region.ravel(), minlength=count + 1)[1:]
     order = np.argsort(-sizes, kind="stable")
     rank = np.zeros(count + 1, region.dtype)

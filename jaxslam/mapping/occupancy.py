@@ -11,6 +11,9 @@ from jaxslam.frontend.lidar import beam_angles
 
 # A cell is occupied if more than this fraction of the beams at it end in it.
 OCCUPIED_FRACTION = 0.25
+MAX_GAP = 0.2  # [m] between two beams that pass beside a cell, so that it is free
+BETWEEN = (-0.25, 0.0, 0.25)  # of the angle between two beams, where space is free between them
+BATCH = 128  # scans at a time
 MARGIN = 0.5  # [m] of unknown cells around the map
 
 
@@ -25,8 +28,9 @@ def occupancy_map(
 
         hits > OCCUPIED_FRACTION (passes + hits)
 
-    free if it was passed and is not occupied, else unknown. Beams without a return are not used:
-    they may have passed glass.
+    free if it was passed and is not occupied, else unknown. A cell that no beam has passed is free
+    if it lies between two neighbouring beams, no more than `MAX_GAP` apart there, that both end
+    beyond it. Beams without a return are not used: they may have passed glass.
 
     Args:
         lidar: The scanner.
@@ -50,32 +54,76 @@ def occupancy_map(
     finite = np.isfinite(scan_poses).all(axis=1)
     if not finite.any():
         raise ValueError("poses: no pose is finite")
-    scan_poses = scan_poses[finite]
-    ranges, hit = ranges[finite], hit[finite]
+    scan_poses, ranges, hit = scan_poses[finite], ranges[finite], hit[finite]
     angle = scan_poses[:, 2:] + np.asarray(beam_angles(lidar), np.float64)
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (T, R, 2)
     ends = scan_poses[:, None, :2] + ranges[..., None] * directions
     low, size, resolution = _extent(np.concatenate([ends[hit], scan_poses[:, :2]]), resolution)
-    passes, hits = np.zeros(np.prod(size), np.int32), np.zeros(np.prod(size), np.int32)
-
-    def cell_of(points: np.ndarray) -> np.ndarray:
-        """Flat indices (N,) of the cells of points (N, 2)."""
-        return np.floor((points - low) / resolution).astype(int) @ [size[1], 1]
-
-    for t in range(len(scan_poses)):
-        end_cell = cell_of(ends[t, hit[t]])
-        num_samples = np.ceil(2.0 * ranges[t, hit[t]] / resolution).astype(int)
-        beam = np.repeat(np.arange(len(num_samples)), num_samples)  # of each sample
-        sample = np.arange(beam.size) - np.repeat(np.cumsum(num_samples) - num_samples, num_samples)
-        step = 0.5 * resolution * sample[:, None] * directions[t, hit[t]][beam]
-        cell = cell_of(scan_poses[t, :2] + step)
+    counts = np.zeros((2, np.prod(size)), np.int64)  # passes, hits
+    beside = np.zeros(counts.shape[1], bool)  # passed between two beams
+    gap = 2.0 * np.sin(0.5 * lidar.angle_increment)  # between two beams, per metre
+    between = 0.5 * (angle[:, 1:] + angle[:, :-1])
+    nearer = np.where(hit[:, 1:] & hit[:, :-1], np.minimum(ranges[:, 1:], ranges[:, :-1]), 0.0)
+    nearer = np.minimum(nearer, MAX_GAP / gap)
+    first = resolution / gap
+    for t in range(0, len(scan_poses), BATCH):
+        part = slice(t, t + BATCH)
+        start = np.broadcast_to((scan_poses[part, None, :2] - low) / resolution, ends[part].shape)
+        struck = hit[part]
+        length = ranges[part][struck] / resolution
+        rays = start[struck], directions[part][struck]
+        row, column = np.floor((ends[part][struck] - low) / resolution).astype(np.int32).T
+        end_cell = row * np.int32(size[1]) + column
+        cell, beam = _passed(size, *rays, length, spacing=0.5)
         # Samples of one beam in one cell follow each other: the first of them counts.
-        first = np.append(True, (cell[1:] != cell[:-1]) | (beam[1:] != beam[:-1]))[: cell.size]
-        np.add.at(passes, cell[first & (cell != end_cell[beam])], 1)
-        np.add.at(hits, end_cell, 1)
+        new = np.append(True, (cell[1:] != cell[:-1]) | (beam[1:] != beam[:-1]))[: cell.size]
+        new &= cell != end_cell[beam]
+        counts[0] += np.bincount(cell[new], minlength=counts.shape[1])
+        counts[1] += np.bincount(end_cell, minlength=counts.shape[1])
+        # Between two beams, from where they are a cell apart.
+        far = nearer[part] > first
+        length = (nearer[part][far] - first) / resolution - 1.0
+        for share in BETWEEN:
+            turn = between[part][far] + share * lidar.angle_increment
+            ahead = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+            begin = start[:, :-1][far] + first / resolution * ahead
+            beside[_passed(size, begin, ahead, length, spacing=1.0)[0]] = True
+    passes, hits = counts
     occupied = hits > OCCUPIED_FRACTION * (passes + hits)
-    free = (passes > 0) & ~occupied
+    free = ((passes > 0) | beside) & ~occupied
     return OccupancyMap(occupied.reshape(size), free.reshape(size), resolution, np.append(low, 0.0))
+
+
+def _passed(
+    size: np.ndarray,
+    start: np.ndarray,
+    direction: np.ndarray,
+    length: np.ndarray,
+    *,
+    spacing: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices (N,) of the cells of samples of rays, in order, and the ray of each.
+
+    Args:
+        size: (2,) of the grid.
+        start: (B, 2) [cells] where each ray begins.
+        direction: (B, 2) of each.
+        length: (B,) [cells] of each; below 0, it has no samples.
+        spacing: [cells] between samples.
+    """
+    count = np.maximum(np.ceil(length / spacing), 0).astype(np.int32)
+    ray = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    first = np.cumsum(count) - count
+    number = np.arange(ray.size, dtype=np.int32) - np.repeat(first.astype(np.int32), count)
+    along = np.float32(spacing) * number.astype(np.float32)
+    row, column = (
+        (
+            np.repeat(start[:, k].astype(np.float32), count)
+            + along * np.repeat(direction[:, k].astype(np.float32), count)
+        ).astype(np.int32)
+        for k in (0, 1)
+    )
+    return row * np.int32(size[1]) + column, ray
 
 
 def _extent(points: np.ndarray, resolution: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -6,13 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxslam.core.maps import TopologicalMap, without_arcs
 from jaxslam.core.measurement import Measurement, ScanMatch
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import trajectories_as_one
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
-from jaxslam.mapping.blocked_arcs import blocked_arcs
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.matching.map_places import ScanMap
 from jaxslam.pipeline import keyframes, odometry_notes, online, self_check, sessions, stages
@@ -119,19 +117,6 @@ def scan_map(run: Run, result: SlamResult) -> ScanMap:
     return ScanMap(run.config.frontend.lidar, result.poses[result.keyframes], scans)
 
 
-def _without_blocked(
-    config: Config, graph: TopologicalMap, poses: np.ndarray, scans: Scan
-) -> tuple[TopologicalMap, tuple[str, ...]]:
-    """A map of several drives without arcs on which the last scans see obstacles; and a note."""
-    lidar = config.frontend.lidar
-    blocked = blocked_arcs(lidar, poses, scans, graph.arc_lines, graph.arc_clearance)
-    if not blocked.any():
-        return graph, ()
-    count = int(blocked.sum())
-    what, on = ("1 arc is", "it") if count == 1 else (f"{count} arcs are", "them")
-    return without_arcs(graph, blocked), (f"{what} gone: the last scans see obstacles on {on}",)
-
-
 def smoother_input(run: Run, filtered: Filtered) -> tuple[Measurement, StepInfo, Scan]:
     """Measurements, diagnostics and scans [K] of keyframes, those of a saved map first; NumPy."""
     info, features, matches, numbers = stages.concatenate(list(filtered.results))
@@ -187,9 +172,6 @@ def result_of(run: Run, filtered: Filtered, guess: np.ndarray | None = None) -> 
     if saved_poses is not None:
         drives.insert(0, saved_poses)
     topological_map = online.topological_map(config, state, trajectories_as_one(drives))
-    if run.smooth and len(drives) > 1:
-        topological_map, gone = _without_blocked(config, topological_map, smoothed, scans)
-        notes += gone
     if matched.matches is not None and config.scan_matching.use_odometry:
         notes += odometry_notes.contradictions(matched.matches)
         notes += odometry_notes.unsigned(matched.matches, matched.odometry)

@@ -12,6 +12,7 @@ from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline import (
     arguments,
     keyframes,
+    mapping_stage,
     odometry_notes,
     online,
     pieces,
@@ -65,8 +66,9 @@ def run_slam(
     (`loop_closure.find_loop_closures`).
 
     Where the map contradicts itself and is smoothed, the drive is closed at places that are found
-    again, metres from where it has them (`reclosing`), if that makes it better; a note says so. A
-    map of several drives loses arcs on which the last scans see obstacles.
+    again, metres from where it has them (`reclosing`), if that makes it better; a note says so. At
+    the end the topological map is made of all scans at these poses (`mapping_stage`); that of
+    several drives loses arcs on which the last scans see obstacles.
 
     Where the robot was moved from one scan to the next (`breaks`), the pieces of the drive are
     mapped on their own, and joined where places are found again (`pieces`). The result is the
@@ -135,6 +137,7 @@ def run_slam(
         results = _several_pieces(run, first, later, saved_map)
     else:
         results = [reclosing.close_again(run, first, result_of(run, first))[1]]
+    results = [mapping_stage.with_maps(config, scans, each, saved_map) for each in results]
     results.sort(key=_importance)
     main, *others = results
     if saved_map is not None and main.saved_poses is None:

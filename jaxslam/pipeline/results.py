@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core.features import Features
-from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.slam_filter import StepInfo
@@ -47,6 +47,8 @@ class SlamResult(NamedTuple):
             in this map.
         saved_poses: (S, 3) float64 [m, m, rad] of the keyframes of the saved map that this one goes
             on in, map frame; None without one. Loop closures with them are not listed.
+        next_id: No node or landmark has had this id or a higher one.
+        occupancy: Occupancy map of the keyframes, those of a saved map too.
         other_parts: Maps of the pieces that nothing joins to this one, each in a frame of its own,
             the largest first.
     """
@@ -67,6 +69,8 @@ class SlamResult(NamedTuple):
     piece: np.ndarray = np.zeros(0, int)
     saved_poses: np.ndarray | None = None
     saved_closures: LoopClosures | None = None
+    next_id: int = 0
+    occupancy: OccupancyMap | None = None
     other_parts: "tuple[SlamResult, ...]" = ()
 
 

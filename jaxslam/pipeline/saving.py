@@ -48,6 +48,8 @@ def to_saved_map(
     hit = np.asarray(scans.hit)
     check_array("scans.hit", hit, (count, lidar.num_beams), np.bool_)
     ranges = as_float64("scans.ranges", scans.ranges, hit.shape).astype(np.float32)
+    belief = used_landmarks(result.belief)
+    next_id: Any = np.maximum(belief.next_id, np.int32(result.next_id))
     new = SavedMap(
         lidar=lidar,
         params=jax.tree.map(np.asarray, params),
@@ -55,7 +57,7 @@ def to_saved_map(
         poses=np.asarray(result.poses, np.float64)[result.keyframes],
         pose_cov=np.asarray(result.info.pose_cov, np.float32),
         scans=Scan._make((np.where(hit, ranges, np.float32(lidar.range_max)), hit)),
-        belief=used_landmarks(result.belief),
+        belief=belief._replace(next_id=next_id),
         arcs=used_arcs(result.arcs),
         topological_map=jax.tree.map(_as_64_bits, result.topological_map),
     )
@@ -73,6 +75,8 @@ def to_saved_map(
 
 
 def _as_64_bits(x: Any) -> np.ndarray:
-    """Integers or floats in 64 bits."""
+    """Integers or floats in 64 bits; truth values stay."""
     x = np.asarray(x)
+    if x.dtype == bool:
+        return x
     return x.astype(np.float64 if x.dtype.kind == "f" else np.int64)

@@ -154,7 +154,7 @@ def test_the_map_holds_confirmed_landmarks_and_arcs_between_nodes_only():
     np.testing.assert_array_equal(graph.xy, [[0, 1], [2, 3], [8, 9]])
     np.testing.assert_array_equal(graph.clearance, [1, 0, 5])
     np.testing.assert_array_equal(graph.id[graph.arc_ends], [[0, 4]])
-    assert [len(x) for x in graph] == [3, 3, 3, 3, 1, 1, 1, 1, 0, 0]
+    assert [len(x) for x in graph] == [3, 3, 3, 3, 1, 1, 1, 1, 0, 0, 0, 0]
     loose = graph_of(belief, arcs, confirm_count=1)
     np.testing.assert_array_equal(loose.id, [0, 1, 2, 4, 6])
     # The arc from 0 to 4 goes through 2, now that it counts.

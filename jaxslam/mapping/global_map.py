@@ -1,0 +1,218 @@
+"""Global topological map: the Voronoi diagram of all scans at their poses, with landmarks as nodes.
+
+`topological_map.build_map` merges the diagrams of single scans, as the paper does. Each of them
+sees a part of the space, and so arcs stay open where no scan saw both of their ends, and wide
+space, where no scan has a diagram, has none. Here all scans are drawn into one grid at their
+estimated poses, and the diagram is that of the whole:
+
+    free cells of all scans -> medial axis of the space that the robot reaches (`medial_axis`)
+    -> landmarks that lie on it are its nodes (`landmark_nodes`) -> arcs through open space
+    (`open_space`) -> ids
+
+When the smoother moves poses, the map is made anew from them, and is still the same graph: a node
+that is a landmark has its id, and any other that of the node of the map before that lies there
+after it has moved with the scans around it (`landmark_nodes.kept_ids`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from jaxslam.core import polylines
+from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.se2_np import compose, relative
+from jaxslam.core.types import CORNER, JUNCTION
+from jaxslam.mapping import grid_topology, medial_axis
+from jaxslam.mapping.landmark_nodes import kept_ids, place_landmarks
+from jaxslam.mapping.medial_axis import FreeConfigurations
+from jaxslam.mapping.open_space import FreeSpace, fill_open_space
+
+RESOLUTION = 0.05
+"""[m] side of the cells of the grid."""
+
+ROBOT_RADIUS = 0.2
+"""[m] space narrower than twice this has no arcs, but where the robot drove."""
+
+MIN_SHARE = 0.01
+"""Of the poses: a region of free space with fewer of them is not mapped."""
+
+STEP = 1.0
+"""[m] The robot drove straight between two poses that are no further apart than this."""
+
+UNKNOWN_NEAR = 0.5
+"""[m] from unknown space, within which an open end may lie."""
+
+
+class GlobalMap(NamedTuple):
+    """A topological map and where it was made.
+
+    Attributes:
+        graph: The map.
+        occupancy: The grid; free where the robot drove.
+        next_id: Id of the next node.
+    """
+
+    graph: TopologicalMap
+    occupancy: OccupancyMap
+    next_id: int
+
+
+def build_global_map(
+    occupancy: OccupancyMap,
+    poses: np.ndarray,
+    merged: TopologicalMap,
+    next_id: int,
+    *,
+    previous: TopologicalMap | None = None,
+    robot_radius: float = ROBOT_RADIUS,
+) -> GlobalMap:
+    """The topological map of a grid that scans were drawn into.
+
+    Args:
+        occupancy: The grid, not turned against the map frame.
+        poses: (T, 3) [m, m, rad] trajectory, map frame; NaN between two drives.
+        merged: The landmarks, their corners and open ends, as `topological_map.build_map` has them.
+        next_id: Id of the next node.
+        previous: An earlier map of the same place, its nodes moved with the poses; nodes that are
+            still there keep their ids.
+        robot_radius: [m] see `ROBOT_RADIUS`.
+
+    Returns:
+        The map. Where no pose lies in free space, `merged` as it is.
+    """
+    occupancy, driven = _with_driven_cells(occupancy, poses)
+    resolution, corner = occupancy.resolution, occupancy.origin[:2]
+    free = medial_axis.free_space(
+        occupancy.occupied,
+        occupancy.free,
+        min_obstacle_size=0.0,
+        min_unknown_size=2 * robot_radius / resolution,
+    )
+    space = medial_axis.free_configurations(
+        free, clearance=robot_radius / resolution, also_free=driven
+    )
+    reached = _reached(space, occupancy, poses)
+    if not reached.any():
+        return GlobalMap(merged, occupancy, next_id)
+    cell_graph = grid_topology.trace_medial_axis(space, occupancy.occupied, reached)
+    graph = grid_topology.to_plane(cell_graph, resolution, corner)
+    place = FreeSpace(space.distance * resolution * reached, resolution, corner, robot_radius)
+    junctions = np.flatnonzero(merged.kind == JUNCTION)
+    landmarks = place_landmarks(graph, merged.xy[junctions], merged.clearance[junctions], place)
+    fill_open_space(graph, place)
+    xy = np.array(graph.xy)
+    ids = np.full(len(xy), -1)
+    ids[list(landmarks)] = merged.id[junctions[list(landmarks.values())]]
+    ids, next_id = kept_ids(ids, xy, previous, next_id)
+    lines = tuple(line.points for line in graph.arcs.values())
+    corners = np.flatnonzero(merged.kind == CORNER)
+    result = TopologicalMap(
+        id=np.concatenate([ids, merged.id[corners]]),
+        xy=np.concatenate([xy, merged.xy[corners]]),
+        kind=np.repeat([JUNCTION, CORNER], [len(xy), len(corners)]),
+        clearance=np.concatenate([place.at(xy), np.zeros(len(corners))]),
+        arc_ends=np.array([[a.start, a.end] for a in graph.arcs.values()], int).reshape(-1, 2),
+        arc_length=np.array([polylines.length(line) for line in lines], float),
+        arc_clearance=grid_topology.line_clearances(lines, space, resolution, corner),
+        arc_lines=lines,
+        arc_filled=np.array([not line.is_branch for line in graph.arcs.values()], bool),
+    )
+    ends = _open_ends(merged, result, occupancy, place)
+    open_ids, next_id = _open_end_ids(ends[0], result, previous, next_id)
+    result = result._replace(frontiers=ends[0], frontier_node=ends[1], frontier_id=open_ids)
+    return GlobalMap(result, occupancy, next_id)
+
+
+def moved_with_poses(graph: TopologicalMap, before: np.ndarray, now: np.ndarray) -> TopologicalMap:
+    """A map whose nodes and open ends have moved with the nearest of some poses.
+
+    Args:
+        graph: The map, of poses `before`.
+        before: (K, 3) [m, m, rad] map frame.
+        now: (K, 3) the same poses as they are estimated now.
+    """
+    tree, transform = cKDTree(before[:, :2]), compose(now, relative(before, np.zeros(3)))
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        frame = transform[tree.query(points)[1]]
+        cosine, sine = np.cos(frame[:, 2]), np.sin(frame[:, 2])
+        x, y = points.T
+        return frame[:, :2] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
+
+    return graph._replace(
+        xy=moved(graph.xy) if len(graph.xy) else graph.xy,
+        frontiers=tuple(moved(line) for line in graph.frontiers),
+    )
+
+
+def _with_driven_cells(
+    occupancy: OccupancyMap, poses: np.ndarray
+) -> tuple[OccupancyMap, np.ndarray]:
+    """The grid, free where the robot drove, and these cells (H, W) bool."""
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    spacing = 0.5 * occupancy.resolution
+    parts = [poses[np.isfinite(poses[:, 0]), :2]]
+    for k in np.flatnonzero(steps <= STEP).tolist():
+        share = np.arange(0.0, 1.0, spacing / max(float(steps[k]), spacing))[:, None]
+        parts.append(poses[k, :2] + share * (poses[k + 1, :2] - poses[k, :2]))
+    cell = np.floor((np.concatenate(parts) - occupancy.origin[:2]) / occupancy.resolution)
+    index = tuple(cell.astype(int)[((cell >= 0) & (cell < occupancy.free.shape)).all(axis=1)].T)
+    driven = np.zeros(occupancy.free.shape, bool)
+    driven[index] = True
+    return occupancy._replace(
+        free=occupancy.free | driven, occupied=occupancy.occupied & ~driven
+    ), driven
+
+
+def _reached(space: FreeConfigurations, occupancy: OccupancyMap, poses: np.ndarray) -> np.ndarray:
+    """Cells (H, W) bool of the regions that the robot was in."""
+    xy = poses[np.isfinite(poses[:, 0]), :2]
+    cell = np.floor((xy - occupancy.origin[:2]) / occupancy.resolution).astype(int)
+    cell = np.clip(cell, 0, np.array(space.region.shape) - 1)
+    counts = np.bincount(space.region[tuple(cell.T)], minlength=int(space.region.max()) + 1)
+    counts[0] = 0
+    return (counts >= max(1.0, MIN_SHARE * len(xy)))[space.region]
+
+
+def _open_ends(
+    merged: TopologicalMap, graph: TopologicalMap, occupancy: OccupancyMap, place: FreeSpace
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Open ends of the diagrams of single scans that lead to unknown space; and their nodes."""
+    known = occupancy.free | occupancy.occupied
+    size = round(UNKNOWN_NEAR / occupancy.resolution)
+    near_unknown = (
+        ndimage.distance_transform_cdt(np.pad(known, 1), "chessboard")[1:-1, 1:-1] <= size
+    )
+    node_of = {int(name): n for n, name in enumerate(graph.id.tolist())}
+    lines, nodes = [], []
+    for line, start in zip(merged.frontiers, merged.frontier_node.tolist(), strict=True):
+        node = node_of.get(int(merged.id[start]))
+        cell = np.floor((line[-1] - occupancy.origin[:2]) / occupancy.resolution).astype(int)
+        inside = bool(((cell >= 0) & (cell < known.shape)).all())
+        if node is None or not inside or not near_unknown[tuple(cell)]:
+            continue
+        line = np.concatenate([graph.xy[[node]], line[1:]])
+        dense = polylines.resample(line, int(2 * polylines.length(line) / place.resolution) + 2)
+        if (place.at(dense) > 0.0).all():
+            lines.append(line)
+            nodes.append(node)
+    return tuple(lines), np.array(nodes, int)
+
+
+def _open_end_ids(
+    lines: tuple[np.ndarray, ...],
+    graph: TopologicalMap,
+    previous: TopologicalMap | None,
+    next_id: int,
+) -> tuple[np.ndarray, int]:
+    """Ids of open ends, those of the map before where they are still open; and the next id."""
+    ends = np.array([line[-1] for line in lines]).reshape(-1, 2)
+    none = np.full(len(ends), -1)
+    if previous is None or len(previous.frontier_id) != len(previous.frontiers):
+        return kept_ids(none, ends, None, next_id)
+    old = np.array([line[-1] for line in previous.frontiers]).reshape(-1, 2)
+    still = ~np.isin(previous.frontier_id, graph.id)
+    before = graph._replace(id=previous.frontier_id[still], xy=old[still])
+    return kept_ids(none, ends, before, next_id)

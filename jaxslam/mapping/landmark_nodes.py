@@ -1,0 +1,128 @@
+"""Which nodes of a diagram are which landmarks, and the ids of all nodes."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from jaxslam.core import polylines
+from jaxslam.core.maps import TopologicalMap
+from jaxslam.mapping.open_space import FreeSpace
+from jaxslam.mapping.plane_graph import Line, PlaneGraph
+
+SAME_NODE = 0.5
+"""[m] or half of the clearance, if that is less, within which node and landmark are the same."""
+
+CONTRADICTED = 0.5
+"""A landmark with less than this share of its clearance left has an obstacle in its circle."""
+
+
+def place_landmarks(
+    graph: PlaneGraph, xy: np.ndarray, clearance: np.ndarray, space: FreeSpace
+) -> dict[int, int]:
+    """Make landmarks nodes of a diagram, in place.
+
+        o  junction or dead end of the diagram:   it is the landmark, and moves onto it
+        -  an arc passes the landmark:            it is split there
+           the arc is within the circle:          a spur leads to the landmark, inside its circle
+           none of these:                         the landmark is no node: space is otherwise there
+
+    A node or an arc is moved onto the landmark if the arcs stay free there.
+
+    Args:
+        graph: The diagram.
+        xy: (L, 2) [m] landmarks, in the order of their ids.
+        clearance: (L,) [m] radii of their circles.
+        space: Free configurations, in which the diagram lies.
+
+    Returns:
+        Landmark, by the number of its node.
+    """
+    names: dict[int, int] = {}
+    left = space.at(xy) if len(xy) else np.zeros(0)
+    usable = np.flatnonzero((left > 0.0) & (left >= CONTRADICTED * clearance))
+    radius = np.minimum(SAME_NODE, 0.5 * clearance)
+    ends = np.flatnonzero(graph.degrees() != 2)
+    pairs = []
+    if len(ends) and len(usable):
+        tree = cKDTree(np.array(graph.xy)[ends])
+        for k in usable.tolist():
+            for near in tree.query_ball_point(xy[k], radius[k]):
+                node = int(ends[near])
+                pairs.append((float(np.hypot(*(graph.xy[node] - xy[k]))), k, node))
+    placed: set[int] = set()
+    for _, k, node in sorted(pairs):
+        if node not in names and k not in placed:
+            names[node] = k
+            placed.add(k)
+            _move(graph, node, xy[k], space)
+    for k in usable.tolist():
+        if k in placed:
+            continue
+        arc, distance, along = graph.nearest(xy[k], float(clearance[k]))
+        if arc < 0:
+            continue
+        node = graph.split(arc, along)
+        if distance < radius[k] and node not in names:
+            _move(graph, node, xy[k], space)
+        elif distance > radius[k] or node in names:
+            if np.hypot(*(graph.xy[node] - xy[k])) < radius[k]:
+                continue  # another landmark stands for this place
+            root, node = node, graph.add_node(xy[k])
+            line = np.array([graph.xy[root], xy[k]])
+            graph.add_arc(Line(root, node, line, False))
+        names[node] = k
+    return names
+
+
+def _move(graph: PlaneGraph, node: int, xy: np.ndarray, space: FreeSpace) -> None:
+    """Move a node to (2,) [m] if its arcs stay free."""
+    before = graph.xy[node]
+    least = _clearance_at(graph, node, space)
+    graph.move(node, xy)
+    if _clearance_at(graph, node, space) < min(least, space.robot_radius):
+        graph.move(node, before)
+
+
+def _clearance_at(graph: PlaneGraph, node: int, space: FreeSpace) -> float:
+    """Least clearance [m] of the arcs of a node; 0 where the robot cannot be."""
+    least = float(space.at(graph.xy[node][None])[0])
+    for line in graph.arcs.values():
+        if node in (line.start, line.end):
+            count = int(2 * polylines.length(line.points) / space.resolution) + 2
+            least = min(least, float(space.at(polylines.resample(line.points, count)).min()))
+    return least
+
+
+def kept_ids(
+    ids: np.ndarray, xy: np.ndarray, previous: TopologicalMap | None, next_id: int
+) -> tuple[np.ndarray, int]:
+    """Ids of nodes, those of an earlier map where they are at the same place.
+
+    Args:
+        ids: (N,) int of the nodes that are landmarks; -1 for others.
+        xy: (N, 2) [m].
+        previous: The earlier map, in the same frame.
+        next_id: Id of the next new node.
+
+    Returns:
+        Ids (N,), all different, and the id of the next new node.
+    """
+    ids = ids.copy()
+    if previous is not None and len(previous.id):
+        old = np.flatnonzero(~np.isin(previous.id, ids))
+        new = np.flatnonzero(ids < 0)
+        if len(old) and len(new):
+            tree = cKDTree(xy[new])
+            near = tree.query_ball_point(previous.xy[old], SAME_NODE)
+            pairs = sorted(
+                (float(np.hypot(*(xy[new[n]] - previous.xy[old[k]]))), int(old[k]), int(new[n]))
+                for k, members in enumerate(near)
+                for n in members
+            )
+            used: set[int] = set()
+            for _, k, n in pairs:
+                if ids[n] < 0 and k not in used:
+                    ids[n] = previous.id[k]
+                    used.add(k)
+    fresh = np.flatnonzero(ids < 0)
+    ids[fresh] = next_id + np.arange(len(fresh))
+    return ids, next_id + len(fresh)

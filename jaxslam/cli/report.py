@@ -10,16 +10,16 @@ import numpy as np
 
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
 from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, tum
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
-from jaxslam.io.geojson import KINDS, Arc, Node
 from jaxslam.io.output import write_json, write_text
+from jaxslam.io.route_graph import route_graph
 from jaxslam.localisation.config import LocaliseInfo
 from jaxslam.mapping import pose_graph
 from jaxslam.mapping.occupancy import occupancy_map
@@ -113,7 +113,12 @@ def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
 
 
 def write_map(
-    path: Path, graph: TopologicalMap, old: AnnotatedMap | None = None, next_id: int = 0
+    path: Path,
+    graph: TopologicalMap,
+    old: AnnotatedMap | None = None,
+    next_id: int = 0,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
 ) -> tuple[str, ...]:
     """Write a topological map as GeoJSON.
 
@@ -123,26 +128,13 @@ def write_map(
         old: Map of the sessions before, as `annotated_map.read` gives it: ids of arcs and what a
             user added are carried over.
         next_id: Id of the next landmark; edges have ids from there on.
+        regions: Rooms and doors of the map.
+        planner: Where its nodes and arcs lie.
 
     Returns:
         Notes on what of `old` could not be kept as it was.
     """
-    nodes = []
-    rows = zip(graph.id, graph.xy, graph.kind, graph.clearance, strict=True)
-    for node, (x, y), kind, clearance in rows:
-        clearance = float(clearance) if kind == JUNCTION else np.nan
-        nodes.append(Node(int(node), float(x), float(y), KINDS[kind], clearance))
-    arcs = [
-        Arc(
-            index,
-            int(graph.id[start]),
-            int(graph.id[end]),
-            float(graph.arc_length[index]),
-            float(graph.arc_clearance[index]),
-            graph.arc_lines[index],
-        )
-        for index, (start, end) in enumerate(graph.arc_ends)
-    ]
+    nodes, arcs = route_graph(graph, regions, planner)
     if old is None:
         geojson.write(path, nodes, arcs, next_id=next_id)
         return ()

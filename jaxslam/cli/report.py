@@ -15,7 +15,7 @@ from jaxslam.core.scan import Scan
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, tum
+from jaxslam.io import g2o_writer, geojson, graphml, lif, map_file, rmf_graph, ros_map, tum
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
 from jaxslam.io.output import write_json, write_text
@@ -40,6 +40,8 @@ def write_results(
     topological_map: TopologicalMap,
     old: AnnotatedMap | None = None,
     next_id: int = 0,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
 ) -> None:
     """Write metrics.json and map.geojson to a folder.
 
@@ -49,8 +51,11 @@ def write_results(
         topological_map: The map.
         old: As of `write_map`.
         next_id: As of `write_map`.
+        regions: As of `write_map`.
+        planner: As of `write_map`.
     """
-    notes = write_map(out_dir / "map.geojson", topological_map, old, next_id)
+    path = out_dir / "map.geojson"
+    notes = write_map(path, topological_map, old, next_id, regions, planner)
     if notes:
         numbers["mended"] = [*numbers.get("mended", ()), *notes]
     write_json(out_dir / "metrics.json", numbers)
@@ -65,8 +70,10 @@ def write_maps(
     times: np.ndarray,
     scans: Scan,
     saved_map: SavedMap | None = None,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
 ) -> None:
-    """Write map.yaml, map.pgm, graph.g2o, map.npz and, if networkx is installed, map.graphml.
+    """Write map.yaml, map.pgm, graph.g2o, map.npz and the files of `write_exports`.
 
     Args:
         out_dir: Folder to write to.
@@ -77,6 +84,8 @@ def write_maps(
         times: (K,) [s] of the keyframes.
         scans: [K] of the keyframes.
         saved_map: The map that the run went on in, if any.
+        regions: Rooms and doors of the map.
+        planner: Where its nodes and arcs lie.
     """
     poses = result.poses[result.keyframes]
     kept = to_saved_map(config, params, result, times, scans, saved_map)
@@ -93,8 +102,27 @@ def write_maps(
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
     map_file.write(out_dir / map_file.NAME, kept)
+    write_exports(out_dir, result.topological_map, regions, planner)
+
+
+def write_exports(
+    out_dir: Path,
+    graph: TopologicalMap,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
+) -> None:
+    """Write map.lif.json, map.rmf.yaml and, if networkx is installed, map.graphml.
+
+    Args:
+        out_dir: Folder to write to.
+        graph: The topological map.
+        regions: Its rooms and doors.
+        planner: Where its nodes and arcs lie.
+    """
+    lif.write(out_dir / "map.lif.json", graph, regions, planner)
+    rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner)
     if find_spec("networkx") is not None:
-        graphml.write(out_dir / "map.graphml", result.topological_map)
+        graphml.write(out_dir / "map.graphml", graph, regions, planner)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:

@@ -17,7 +17,7 @@ def route_graph(
     *,
     with_operations: bool = True,
 ) -> tuple[list[Node], list[Arc]]:
-    """Nodes and arcs of a map, numbered as in the map; open ends that have ids come last.
+    """All nodes and arcs of a map, numbered as in the map; open ends that have ids come last.
 
     An open end is a node of kind `frontier` at the last point of its polyline, and an arc from its
     node to there, whose clearance is not known.
@@ -61,7 +61,7 @@ def route_graph(
 
 
 def _open_ends(graph: TopologicalMap) -> tuple[list[Node], list[Arc]]:
-    """Nodes and arcs of open ends."""
+    """The nodes and arcs of open ends."""
     nodes, arcs = [], []
     rows = zip(graph.frontier_id, graph.frontier_node, graph.frontiers, strict=True)
     for index, (frontier, node, line) in enumerate(rows, start=len(graph.arc_ends)):

@@ -213,7 +213,7 @@ def test_data_of_another_map_are_refused(tmp_path, change, message):
 
 
 def test_geopandas_reads_points_and_lines_with_their_properties(tmp_path):
-    geopandas = pytest.importorskip("geopandas", reason="pip install 'jaxslam[interop]'")
+    geopandas = pytest.importorskip("geopandas", reason="pip install 'jaxslam[test]'")
     written(tmp_path / "map.geojson")
     frame = geopandas.read_file(tmp_path / "map.geojson")
     points = frame[frame.geometry.geom_type == "Point"].set_index("id")

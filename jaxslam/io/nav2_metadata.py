@@ -8,7 +8,14 @@
 
 These keys a user may set too: a value that is not as it is written here is the user's, and stays.
 Of nav2_route, `AdjustSpeedLimit` takes `speed_limit` as a percentage and `DistanceScorer` divides
-the length by it, so that all edges have one; both take a number with a decimal point only.
+the length by it, so that all edges have one; both take a number with a decimal point only. Route
+tracking ends with an error at an operation that its parameters do not have:
+
+    operations: ["AdjustSpeedLimit", "ReroutingService", "OpenDoor"]
+    OpenDoor: {plugin: "nav2_route::TriggerEvent"}
+
+The plugin calls the service `door_3/open` (std_srvs/Trigger) of a door when the robot enters an
+edge that passes through it.
 """
 
 import re

@@ -92,3 +92,12 @@ def test_small_loops_are_left_out_and_bad_maps_refused():
         straight_lanes(graph._replace(arc_lines=(*graph.arc_lines[:3], np.zeros(3))))
     with pytest.raises(ValueError, match="not finite"):
         straight_lanes(graph._replace(xy=np.full((4, 2), np.nan)))
+
+
+def test_lanes_start_at_the_node_where_a_polyline_starts_beside_it():
+    graph = building()
+    moved = graph.arc_lines[1] + np.array([[0.0, 0.5], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    found = straight_lanes(
+        graph._replace(arc_lines=(graph.arc_lines[0], moved, *graph.arc_lines[2:]))
+    )
+    assert len(along(found, 1)[0]) == 2

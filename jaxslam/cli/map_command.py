@@ -26,7 +26,8 @@ def map_occupancy(
 ) -> None:
     """Extract the topological map of a ROS occupancy grid.
 
-    Writes metrics.json, map.geojson, map.graphml and map.png; needs the extras [ros] and [graph].
+    Writes metrics.json, map.geojson, map.graphml, map.lif.json and map.rmf.yaml, for fleets, and
+    map.png; needs the extras [ros] and [graph].
 
     Args:
         map_file: YAML file of map_server, with its image in the same folder.
@@ -71,7 +72,7 @@ def map_occupancy(
         numbers |= {"clearance_m": robot_radius, "seconds": seconds}
         write_json(out_dir / "metrics.json", numbers)
         report.write_map(out_dir / "map.geojson", result.graph)
-        graphml.write(out_dir / "map.graphml", result.graph)
+        report.write_exports(out_dir, result.graph)
         report.draw_map(out_dir / "map.png", grid, result.graph)
         bar.update()
     title = f"{map_file}: robot radius {robot_radius:g} m, regions {result.num_regions}"

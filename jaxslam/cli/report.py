@@ -10,16 +10,16 @@ import numpy as np
 
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, tum
+from jaxslam.io import g2o_writer, geojson, graphml, lif, map_file, rmf_graph, ros_map, tum
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
-from jaxslam.io.geojson import KINDS, Arc, Node
 from jaxslam.io.output import write_json, write_text
+from jaxslam.io.route_graph import route_graph
 from jaxslam.localisation.config import LocaliseInfo
 from jaxslam.mapping import pose_graph
 from jaxslam.mapping.saved_map import SavedMap
@@ -37,6 +37,8 @@ def write_results(
     topological_map: TopologicalMap,
     old: AnnotatedMap | None = None,
     next_id: int = 0,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
 ) -> None:
     """Write metrics.json and map.geojson to a folder.
 
@@ -46,8 +48,11 @@ def write_results(
         topological_map: The map.
         old: As of `write_map`.
         next_id: As of `write_map`.
+        regions: As of `write_map`.
+        planner: As of `write_map`.
     """
-    notes = write_map(out_dir / "map.geojson", topological_map, old, next_id)
+    path = out_dir / "map.geojson"
+    notes = write_map(path, topological_map, old, next_id, regions, planner)
     if notes:
         numbers["mended"] = [*numbers.get("mended", ()), *notes]
     write_json(out_dir / "metrics.json", numbers)
@@ -62,8 +67,10 @@ def write_maps(
     times: np.ndarray,
     scans: Scan,
     saved_map: SavedMap | None = None,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
 ) -> None:
-    """Write map.yaml, map.pgm, graph.g2o, map.npz and, if networkx is installed, map.graphml.
+    """Write map.yaml, map.pgm, graph.g2o, map.npz and the files of `write_exports`.
 
     Args:
         out_dir: Folder to write to.
@@ -74,6 +81,8 @@ def write_maps(
         times: (K,) [s] of the keyframes.
         scans: [K] of the keyframes.
         saved_map: The map that the run went on in, if any.
+        regions: Rooms and doors of the map.
+        planner: Where its nodes and arcs lie.
     """
     poses = result.poses[result.keyframes]
     kept = to_saved_map(config, params, result, times, scans, saved_map)
@@ -90,8 +99,27 @@ def write_maps(
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
     map_file.write(out_dir / map_file.NAME, kept)
+    write_exports(out_dir, result.topological_map, regions, planner)
+
+
+def write_exports(
+    out_dir: Path,
+    graph: TopologicalMap,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
+) -> None:
+    """Write map.lif.json, map.rmf.yaml and, if networkx is installed, map.graphml.
+
+    Args:
+        out_dir: Folder to write to.
+        graph: The topological map.
+        regions: Its rooms and doors.
+        planner: Where its nodes and arcs lie.
+    """
+    lif.write(out_dir / "map.lif.json", graph, regions, planner)
+    rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner)
     if find_spec("networkx") is not None:
-        graphml.write(out_dir / "map.graphml", result.topological_map)
+        graphml.write(out_dir / "map.graphml", graph, regions, planner)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
@@ -110,7 +138,12 @@ def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
 
 
 def write_map(
-    path: Path, graph: TopologicalMap, old: AnnotatedMap | None = None, next_id: int = 0
+    path: Path,
+    graph: TopologicalMap,
+    old: AnnotatedMap | None = None,
+    next_id: int = 0,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
 ) -> tuple[str, ...]:
     """Write a topological map as GeoJSON.
 
@@ -120,26 +153,13 @@ def write_map(
         old: Map of the sessions before, as `annotated_map.read` gives it: ids of arcs and what a
             user added are carried over.
         next_id: Id of the next landmark; edges have ids from there on.
+        regions: Rooms and doors of the map.
+        planner: Where its nodes and arcs lie.
 
     Returns:
         Notes on what of `old` could not be kept as it was.
     """
-    nodes = []
-    rows = zip(graph.id, graph.xy, graph.kind, graph.clearance, strict=True)
-    for node, (x, y), kind, clearance in rows:
-        clearance = float(clearance) if kind == JUNCTION else np.nan
-        nodes.append(Node(int(node), float(x), float(y), KINDS[kind], clearance))
-    arcs = [
-        Arc(
-            index,
-            int(graph.id[start]),
-            int(graph.id[end]),
-            float(graph.arc_length[index]),
-            float(graph.arc_clearance[index]),
-            graph.arc_lines[index],
-        )
-        for index, (start, end) in enumerate(graph.arc_ends)
-    ]
+    nodes, arcs = route_graph(graph, regions, planner)
     if old is None:
         geojson.write(path, nodes, arcs, next_id=next_id)
         return ()

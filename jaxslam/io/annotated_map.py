@@ -2,7 +2,8 @@
 
 Ours are the Points whose `metadata.kind` is one of `KINDS`, and the lines with a `metadata.arc`;
 all other features are the user's. Of ours the keys that `geojson.write` writes are ours, all other
-keys, also those in `metadata` and `operations`, are the user's. Editors may write numbers as "12"
+keys, also those in `metadata` and `operations`, are the user's; so is what `nav2_metadata` writes,
+where it is not as written there. Editors may write numbers as "12"
 or 12.0, nested objects as strings of JSON, missing values as null, and ids as members of features.
 """
 
@@ -17,6 +18,7 @@ import numpy as np
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
 from jaxslam.io.geojson import COUNTERS, KINDS
+from jaxslam.io.nav2_metadata import users_metadata, users_operations
 
 MAX_ID = 2**31 - 2  # ids are int32, also the one after it
 MAX_COORDINATE = 1e9  # [m]
@@ -207,9 +209,10 @@ def _of_user(
         if kept.get(key, 0) is None:
             del kept[key]
     metadata = _as_object(kept.pop("metadata", None))
+    metadata = users_metadata(metadata, _length(metadata.get("clearance")))
     metadata = {key: value for key, value in metadata.items() if key not in own_metadata}
     operations = kept.pop("operations", None)
-    operations = _as_object(operations) or operations
+    operations = users_operations(_as_object(operations) or operations)
     if metadata:
         kept["metadata"] = metadata
     if operations and operations != "{}":
@@ -241,16 +244,20 @@ def _edge(
     metadata: Mapping[str, Any],
 ) -> OldEdge:
     """One direction of an arc."""
-    length = metadata.get("length")
-    known = isinstance(length, int | float) and not isinstance(length, bool)
     return OldEdge(
         id=edge_id,
         start=_number(where, "properties.startid", properties.get("startid")),
         end=_number(where, "properties.endid", properties.get("endid")),
-        length=float(length) if known and length is not None else math.nan,
+        length=_length(metadata.get("length")),
         line=_line(where, geometry),
         properties=_of_user(properties, EDGE_KEYS, EDGE_METADATA),
     )
+
+
+def _length(value: Any) -> float:
+    """A length [m] of the metadata, NaN if it is no number."""
+    known = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if known else math.nan
 
 
 def _line(where: _Place, geometry: Mapping[str, Any]) -> np.ndarray | None:

@@ -2,12 +2,15 @@
 
 VERTEX_SE2 id x y theta                      poses of the scans, 0..T-1
 VERTEX_XY id x y                             landmarks
-FIX 0
 EDGE_SE2 a b x y theta + 6 numbers           odometry, with information (upper triangle); then
                                              loop closures, from the earlier pose to the later
 EDGE_SE2_XY a b x y + 3 numbers              landmark measurements, robot frame, likewise
+FIX 0
 
-Wall directions have no line type in this format and are left out.
+Wall directions have no line type in this format and are left out. The error of an EDGE_SE2 is the
+second pose in the frame of the measured second pose, and its information is that of this error.
+GTSAM 4.3 reads no edge behind a line it does not know, which `FIX` and comments are: `FIX` is last
+and there are no comments. Its `readG2o` leaves out EDGE_SE2_XY by design.
 """
 
 from collections.abc import Iterable
@@ -20,9 +23,17 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_text
 from jaxslam.mapping.pose_graph import PoseGraph
 
+LEAST_EIGENVALUE = 1e-9
+"""Least eigenvalue of a loop closure's information, as a fraction of its largest.
+
+Readers factorise the matrix. Rounding errs by about 1e-15 of the largest eigenvalue, so that of one
+that is zero some make a tie of decimetres. From this fraction on GTSAM has eigenvalues to 2e-7, and
+the tie that it adds is one of 30 m or weaker where the closure is good to 1 mm.
+"""
+
 
 def write(path: str | PathLike, graph: PoseGraph) -> None:
-    """Write a graph; every number is read back exactly.
+    """Write a graph; poses and measurements are read back exactly.
 
     Args:
         path: File to write, atomically.
@@ -42,11 +53,10 @@ def write(path: str | PathLike, graph: PoseGraph) -> None:
         _line("VERTEX_XY", (first_landmark + index,), position)
         for index, position in enumerate(graph.landmark_positions)
     ]
-    text.append("FIX 0")
     consecutive = [(index, index + 1) for index in range(len(graph.odometry))]
     text += _relative_poses(consecutive, graph.odometry, graph.odometry_information)
     text += _relative_poses(
-        graph.closure_ends.tolist(), graph.closure_pose, graph.closure_information
+        graph.closure_ends.tolist(), graph.closure_pose, with_floor(graph.closure_information)
     )
     observed = zip(
         graph.pose_index,
@@ -59,7 +69,30 @@ def write(path: str | PathLike, graph: PoseGraph) -> None:
         vertices = int(pose), first_landmark + int(landmark)
         numbers = [*position, *information[np.triu_indices(2)]]
         text.append(_line("EDGE_SE2_XY", vertices, numbers))
+    if first_landmark:
+        text.append("FIX 0")
     write_text(path, "\n".join(text) + "\n")
+
+
+def with_floor(information: np.ndarray) -> np.ndarray:
+    """Information matrices (N, k, k) with eigenvalues of at least `LEAST_EIGENVALUE` x the largest.
+
+    A matrix whose eigenvalues are so large stays as it is.
+    """
+    eigenvalues, axes = np.linalg.eigh(information)
+    missing = np.maximum(LEAST_EIGENVALUE * eigenvalues[:, -1:] - eigenvalues, 0.0)
+    added: np.ndarray = (axes * missing[:, None]) @ axes.swapaxes(1, 2)
+    return information + added
+
+
+def in_frame_of_second(relative_poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Information (N, 3, 3) of relative poses (N, 3), turned from the first frame to the second."""
+    c, s = np.cos(relative_poses[:, 2]), np.sin(relative_poses[:, 2])
+    turn = np.zeros((len(relative_poses), 3, 3))
+    turn[:, :2, :2] = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    turn[:, 2, 2] = 1.0
+    turned: np.ndarray = turn.swapaxes(1, 2) @ information @ turn
+    return turned
 
 
 def _checked(graph: PoseGraph) -> PoseGraph:
@@ -104,8 +137,9 @@ def _indices(name: str, x: AnyArray, shape: tuple[int, ...], count: int) -> np.n
 def _relative_poses(
     pairs: Iterable[Iterable[int]], relative_poses: np.ndarray, information: np.ndarray
 ) -> list[str]:
-    """EDGE_SE2 lines of relative poses (N, 3) between vertices, with information (N, 3, 3)."""
+    """EDGE_SE2 lines of relative poses (N, 3), with information (N, 3, 3) in the first frame."""
     upper = np.triu_indices(3)
+    information = in_frame_of_second(relative_poses, information)
     return [
         _line("EDGE_SE2", pair, [*pose, *matrix[upper]])
         for pair, pose, matrix in zip(pairs, relative_poses, information, strict=True)

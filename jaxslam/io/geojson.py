@@ -15,8 +15,9 @@ import numpy as np
 
 from jaxslam.io.output import write_json
 
-# Kinds of nodes in the file: junction, corner, wall direction.
-KINDS = ("node", "corner", "wall")
+FRONTIER = "frontier"
+KINDS = ("node", "corner", "wall", FRONTIER)
+"""Kinds of nodes in the file: junction, corner, wall direction, open end."""
 COUNTERS = "jaxslam"
 """Member of the file: no edge or arc has had an id as high as `next_id` or `next_arc`; absent where
 the features in the file show as much."""
@@ -33,6 +34,7 @@ class Node(NamedTuple):
         kind: Kind of landmark.
         clearance: [m] to the nearest wall; left out of the file unless finite.
         properties: More properties, of the user; ours win.
+        metadata: More metadata of ours; the user's win.
     """
 
     id: int
@@ -41,6 +43,7 @@ class Node(NamedTuple):
     kind: str
     clearance: float
     properties: Mapping[str, Any] = NOTHING
+    metadata: Mapping[str, Any] = NOTHING
 
 
 class Arc(NamedTuple):
@@ -55,6 +58,8 @@ class Arc(NamedTuple):
         points: (k, 2) [m, map frame] polyline from start to end.
         edges: Ids of the edges from start to end and back; None for those after the highest node.
         properties: More properties of these two edges, of the user; ours win.
+        metadata: More metadata of both edges, of ours; the user's win.
+        operations: Operations of both edges, of ours; the user's win.
     """
 
     id: int
@@ -65,6 +70,8 @@ class Arc(NamedTuple):
     points: np.ndarray
     edges: tuple[int, int] | None = None
     properties: tuple[Mapping[str, Any], Mapping[str, Any]] = (NOTHING, NOTHING)
+    metadata: Mapping[str, Any] = NOTHING
+    operations: Mapping[str, Any] = NOTHING
 
 
 def write(
@@ -148,7 +155,7 @@ def _node_feature(node: Node, frame: str) -> dict[str, Any]:
     }
     return {
         "type": "Feature",
-        "properties": _merged(properties, node.properties),
+        "properties": _merged(properties, _added(node.properties, node.metadata)),
         "geometry": {"type": "Point", "coordinates": [float(node.x), float(node.y)]},
     }
 
@@ -168,9 +175,26 @@ def _edge_feature(
     }
     return {
         "type": "Feature",
-        "properties": _merged(properties, own),
+        "properties": _merged(properties, _added(own, arc.metadata, arc.operations)),
         "geometry": {"type": "MultiLineString", "coordinates": [points.tolist()]},
     }
+
+
+def _added(
+    own: Mapping[str, Any], metadata: Mapping[str, Any], operations: Mapping[str, Any] = NOTHING
+) -> Mapping[str, Any]:
+    """The user's properties with metadata and operations of ours, where the user has no others."""
+    added = dict(own)
+    if metadata:
+        theirs = own.get("metadata")
+        added["metadata"] = dict(metadata) | dict(theirs if isinstance(theirs, Mapping) else {})
+    if operations:
+        theirs = own.get("operations") or {}
+        if isinstance(theirs, Mapping):
+            added["operations"] = dict(operations) | dict(theirs)
+        elif isinstance(theirs, list):
+            added["operations"] = [*operations.values(), *theirs]
+    return added
 
 
 def _merged(ours: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,9 @@
-"""Topological maps as GraphML, for networkx, igraph, Gephi; needs the extra `[graph]`."""
+"""Topological maps as GraphML, for networkx, igraph, Gephi; needs the extra `[graph]`.
+
+All that identifies a node or arc is an attribute too. networkx takes the ids of nodes and edges
+from the file, igraph 1.0 gives the ids of nodes to its edges: `name`, `arc`, `start` and `end` are
+the same for all readers.
+"""
 
 import math
 from collections.abc import Mapping
@@ -9,9 +14,12 @@ from typing import Any
 import numpy as np
 
 from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.types import as_float64
 from jaxslam.io.errors import InputError
+from jaxslam.io.nav2_metadata import node_metadata
 from jaxslam.io.output import write_text
+from jaxslam.io.route_labels import arc_clearances, labels
 
 
 def require() -> None:
@@ -21,35 +29,54 @@ def require() -> None:
         raise InputError("networkx is needed to write map.graphml", advice=advice)
 
 
-def write(path: str | PathLike, graph: TopologicalMap) -> None:
+def write(
+    path: str | PathLike,
+    graph: TopologicalMap,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
+) -> None:
     """Write a map as an undirected multigraph.
 
-    A node has `x`, `y` and `clearance`, an edge `length` and `clearance`, all [m], and `line`,
-    the polyline in well-known text from `source` to `target`. Values that are not finite are left
-    out.
+    A node has `name`, its id, `x`, `y` and `clearance`, an edge its number `arc`, the names `start`
+    and `end` of its nodes, `length` and `clearance`, all [m], and `line`, the polyline in
+    well-known text from `start` to `end`. Both have their `region` and `class`, an edge its `door`
+    and `widths`, the clearances [m] at the points of `line`, with commas. Values that are not
+    finite, or empty, are left out; of `widths` they are `nan`.
 
     Args:
         path: File to write, atomically.
         graph: The map.
+        regions: Its rooms and doors.
+        planner: Where its nodes and arcs lie.
 
     Raises:
-        ValueError: A field of the map is not numbers of its shape, or an arc ends at no node.
+        ValueError: A field of the map is not numbers of its shape, an arc ends at no node, or
+            `planner` is of another map.
         InputError: networkx is not installed, or the file cannot be written.
     """
     require()
     import networkx
 
     graph = _checked(graph)
-
+    of_nodes, of_arcs = labels(graph, regions, planner)
+    clearances = arc_clearances(graph, planner)
     multigraph = networkx.MultiGraph()
-    for node, (x, y), clearance in zip(graph.id, graph.xy, graph.clearance, strict=True):
-        attributes = {"x": float(x), "y": float(y)} | _finite({"clearance": clearance})
+    rows = zip(graph.id, graph.xy, graph.clearance, of_nodes, strict=True)
+    for node, (x, y), clearance, label in rows:
+        attributes: dict[str, Any] = {"name": str(node), "x": float(x), "y": float(y)}
+        attributes |= _finite({"clearance": clearance}) | node_metadata(label)
         multigraph.add_nodes_from([(int(node), attributes)])
     for index, (start, end) in enumerate(graph.arc_ends):
-        numbers = {"length": graph.arc_length[index], "clearance": graph.arc_clearance[index]}
-        line = {"line": _well_known_text(graph.arc_lines[index])}
+        numbers = {"length": graph.arc_length[index], "clearance": clearances[index]}
         source, target = int(graph.id[start]), int(graph.id[end])
-        multigraph.add_edges_from([(source, target, index, line | _finite(numbers))])
+        attributes = {"arc": index, "start": str(source), "end": str(target)}
+        attributes |= {"line": _well_known_text(graph.arc_lines[index])}
+        attributes |= _finite(numbers) | node_metadata(of_arcs[index])
+        if of_arcs[index].doors:
+            attributes["door"] = ",".join(of_arcs[index].doors)
+        if planner is not None:
+            attributes["widths"] = ",".join(f"{width:.3f}" for width in planner.arc_widths[index])
+        multigraph.add_edges_from([(source, target, index, attributes)])
     write_text(path, "\n".join(networkx.generate_graphml(multigraph)) + "\n")
 
 

@@ -29,14 +29,14 @@ class PoseGraph(NamedTuple):
         poses: (T, 3) [m, m, rad] estimates, map frame.
         landmark_positions: (L, 2) [m] estimates, map frame.
         odometry: (T - 1, 3) [m, m, rad] odometry from each pose to the next, in its frame.
-        odometry_information: (T - 1, 3, 3) inverse covariance.
+        odometry_information: (T - 1, 3, 3) inverse covariance, in the frame of the first pose.
         pose_index: (K,) index of the pose that a landmark was observed from.
         landmark_index: (K,) index of the landmark.
         landmark_xy: (K, 2) [m] observed position, robot frame.
         landmark_information: (K, 2, 2) inverse covariance.
         closure_ends: (C, 2) indices of the two poses of a loop closure.
         closure_pose: (C, 3) [m, m, rad] the second pose in the frame of the first.
-        closure_information: (C, 3, 3) inverse covariance.
+        closure_information: (C, 3, 3) inverse covariance, in the frame of the first pose.
     """
 
     poses: np.ndarray

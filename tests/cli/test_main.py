@@ -177,7 +177,15 @@ def test_evo_reads_the_trajectories(done):
 @pytest.mark.slow
 def test_run_writes_its_files_and_nothing_else(done):
     names = {"metrics.json", "trajectory.tum", "map.geojson", "map.graphml", "map.yaml", "map.pgm"}
-    names |= {"map.npz", "graph.g2o", "scan.png", "run.gif", *PICTURES}
+    names |= {
+        "map.lif.json",
+        "map.rmf.yaml",
+        "map.npz",
+        "graph.g2o",
+        "scan.png",
+        "run.gif",
+        *PICTURES,
+    }
     assert {file.name for file in done.recorded.iterdir()} == names
     assert [file.name for file in done.recorded.parent.iterdir()] == ["recorded"]
     check_map(done.recorded)

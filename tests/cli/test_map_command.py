@@ -12,7 +12,7 @@ from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.io import graphml
 from jaxslam.viz import canvas, maps
 
-FILES = {"metrics.json", "map.geojson", "map.graphml", "map.png"}
+FILES = {"metrics.json", "map.geojson", "map.graphml", "map.lif.json", "map.rmf.yaml", "map.png"}
 YAML = "image: a.pgm\nresolution: 0.1\norigin: [-2.0, 1.0, 0.0]\nnegate: 0\n"
 YAML += "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
 MAPS = Path(__file__).resolve().parents[3] / "shared" / "data" / "maps"

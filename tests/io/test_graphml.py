@@ -1,6 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_building import ARC_WIDTHS, building, planner, regions
 
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.types import JUNCTION
@@ -32,14 +33,60 @@ def test_networkx_reads_the_map(tmp_path, convert):
     graphml.write(tmp_path / "map.graphml", numbers)
     found = networkx.read_graphml(tmp_path / "map.graphml", force_multigraph=True)
     assert dict(found.nodes(data=True)) == {
-        "5": {"x": 0.0, "y": 0.5, "clearance": 1.0},
-        "8": {"x": 2.0, "y": 0.0},
+        "5": {"name": "5", "x": 0.0, "y": 0.5, "clearance": 1.0},
+        "8": {"name": "8", "x": 2.0, "y": 0.0},
     }
     line = "LINESTRING (0.0 0.5, 2.0 0.0)"
     (arc,) = found.get_edge_data("5", "8").values()
-    assert arc == {"length": 2.5, "clearance": 0.75, "line": line}
+    names = {"arc": 0, "start": "5", "end": "8"}
+    assert arc == names | {"length": 2.5, "clearance": 0.75, "line": line}
     (loop,) = found.get_edge_data("8", "8").values()
-    assert loop["length"] == 3.0 and "clearance" not in loop
+    assert loop["length"] == 3.0 and "clearance" not in loop and loop["arc"] == 1
+
+
+def test_networkx_reads_regions_doors_and_widths(tmp_path):
+    graphml.write(tmp_path / "map.graphml", building(), regions(), planner())
+    found = networkx.read_graphml(tmp_path / "map.graphml", force_multigraph=True)
+    nodes = {name: (data.get("region"), data.get("class")) for name, data in found.nodes.items()}
+    corridor, room = ("room_2", "corridor"), ("room_1", "room")
+    assert nodes == {"5": corridor, "7": (None, None), "8": corridor, "11": room}
+    arcs = {data["arc"]: data for *_, data in found.edges(data=True)}
+    assert (arcs[0]["region"], arcs[0]["class"]) == ("room_2", "door")
+    assert arcs[0]["door"] == "door_3,door_4" and "door" not in arcs[1]
+    widths = [float(width) for width in arcs[1]["widths"].split(",")]
+    np.testing.assert_array_equal(widths, ARC_WIDTHS[1])
+    assert arcs[0]["clearance"] == 0.45 and "clearance" not in arcs[2] and "class" not in arcs[2]
+
+
+def test_igraph_reads_all_nodes_and_arcs_by_their_names(tmp_path):
+    """Its edges' own ids are those of nodes, which is why arcs have attributes for all of it."""
+    igraph = pytest.importorskip("igraph", reason="pip install 'jaxslam[test]'")
+    rng = np.random.default_rng(0)
+    count = 40
+    ends = np.concatenate([rng.integers(0, count, (60, 2)), [[3, 3], [3, 3], [1, 2], [2, 1]]])
+    graph = building()._replace(
+        id=rng.permutation(100)[:count],  # some are numbers of arcs, too
+        xy=rng.normal(size=(count, 2)),
+        kind=np.full(count, JUNCTION),
+        clearance=rng.uniform(size=count),
+        arc_ends=ends,
+        arc_length=rng.uniform(size=len(ends)),
+        arc_clearance=rng.uniform(size=len(ends)),
+        arc_lines=tuple(rng.normal(size=(len(ends), 3, 2))),
+    )
+    graphml.write(tmp_path / "map.graphml", graph)
+    found = igraph.Graph.Read_GraphML(str(tmp_path / "map.graphml"))
+    assert found.vcount() == count and found.ecount() == len(ends)
+    for node, (x, y) in zip(graph.id.tolist(), graph.xy.tolist(), strict=True):
+        vertex = found.vs.find(name=str(node))
+        assert (vertex["x"], vertex["y"]) == (x, y)
+    for arc, pair in enumerate(ends.tolist()):
+        edge = found.es.find(arc=arc)
+        start, end = (str(graph.id[k]) for k in pair)
+        assert {found.vs[k]["name"] for k in edge.tuple} == {start, end}
+        assert (edge["start"], edge["end"]) == (start, end)
+        assert edge["length"] == graph.arc_length[arc]
+        assert edge["line"] == graphml._well_known_text(graph.arc_lines[arc])
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,8 @@ def test_an_optimiser_finds_the_true_trajectory_in_the_pose_graph(drive, tmp_pat
         whitened = []
         for (a, b), (*measured, i, j, k, u, v, w) in graph["EDGE_SE2"]:
             motion = rotated(pose[a][2], pose[b][:2] - pose[a][:2])
-            error = np.append(motion, pose[b][2] - pose[a][2]) - measured
+            moved = rotated(measured[2], motion - measured[:2])  # in the measured second frame
+            error = np.append(moved, pose[b][2] - pose[a][2] - measured[2])
             error[2] = (error[2] + np.pi) % (2 * np.pi) - np.pi
             whitened.append(root_of([i, j, k, u, v, w], 3) @ error)
         for (a, b), (u, v, i, j, k) in graph["EDGE_SE2_XY"]:

@@ -20,7 +20,7 @@ from jaxslam.mapping.arc_points import arc_points
 from jaxslam.mapping.clearance import clearance_field
 from jaxslam.mapping.free_paths import free_space
 from jaxslam.mapping.planner_data import check_types
-from jaxslam.mapping.route_legs import Leg, followed, split_into_legs
+from jaxslam.mapping.route_legs import Leg, followed, split_into_legs, without_straight_points
 
 
 class PlannedRoute(NamedTuple):
@@ -97,9 +97,9 @@ def route(
     line, arc = found
     legs = split_into_legs(topological_map, line, arc, field=field, regions=regions)
     return PlannedRoute(
-        line=_without_straight_points(line),
+        line=without_straight_points(line),
         length=float(np.hypot(*np.diff(line, axis=0).T).sum()),
-        clearance=min(leg.clearance for leg in legs),
+        clearance=float(np.min([leg.clearance for leg in legs])),
         arcs=followed(arc),
         legs=legs,
     )
@@ -132,13 +132,3 @@ def _check_radius(robot_radius: float) -> None:
     """Raise ValueError if a radius is no length."""
     if not 0.0 <= robot_radius < np.inf:
         raise ValueError(f"robot_radius is {robot_radius}, not a number of metres >= 0")
-
-
-def _without_straight_points(line: np.ndarray) -> np.ndarray:
-    """A polyline (n, 2) without the points where it goes straight on, or stays."""
-    line = line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-9)]
-    before, after = np.diff(line[:-1], axis=0), np.diff(line[1:], axis=0)
-    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    size = np.hypot(*before.T) * np.hypot(*after.T)
-    straight = (np.abs(cross) < 1e-6 * size) & (np.sum(before * after, axis=1) > 0)
-    return line[np.concatenate([[True], ~straight, [True]])] if len(line) > 2 else line

@@ -41,7 +41,7 @@ def checked_point(name: str, xy: ArrayLike) -> np.ndarray:
     """A point (2,) [m] as an array; ValueError if it is none or not finite."""
     point = as_float64(name, xy, (2,))
     if not np.isfinite(point).all():
-        raise ValueError(f"{name} is ({point[0]:g}, {point[1]:g}), not finite")
+        raise ValueError(f"{name} ({point[0]:g}, {point[1]:g}) is not finite")
     return point
 
 
@@ -105,24 +105,30 @@ def _middle(regions: Regions, index: int, field: ClearanceField | None) -> np.nd
 
 def require_free(name: str, xy: np.ndarray, space: FreeSpace, robot_radius: float) -> None:
     """Raise ValueError unless a robot may be at a point (2,) [m]."""
-    field, where = space.field, f"{name} is at {text(xy)}"
+    field, where = space.field, f"{name} {text(xy)} is"
     if not field.contains(xy[None])[0]:
         h, w = field.free.shape
         corners = field.to_map(np.array([[0, 0], [h, 0], [0, w], [h, w]], float))
         (x, y), (x_max, y_max) = corners.min(axis=0), corners.max(axis=0)
         limits = f"x {x:.1f} to {x_max:.1f} m, y {y:.1f} to {y_max:.1f} m"
-        raise ValueError(f"{where}, outside of the map, which reaches {limits}")
+        raise ValueError(f"{where} outside of the map, which reaches {limits}")
     cell = tuple(np.floor(field.to_cells(xy[None])[0]).astype(int))
     if field.distance[cell] == 0.0:
-        raise ValueError(f"{where}, in a wall")
+        raise ValueError(f"{where} in a wall")
     if not field.free[cell]:
-        raise ValueError(f"{where}, in unknown space")
+        raise ValueError(f"{where} in unknown space")
     if not space.free[cell]:
         near = min(float(clearance_at(field, xy[None])[0]), field.distance[cell])
-        raise ValueError(
-            f"{where}, {near:.2f} m from an obstacle, nearer than the robot radius of "
-            f"{robot_radius:g} m"
-        )
+        problem = f"{where} {near:.2f} m from an obstacle, nearer than the robot radius of"
+        raise ValueError(f"{problem} {robot_radius:g} m{_nearest_free(space, xy)}")
+
+
+def _nearest_free(space: FreeSpace, xy: np.ndarray) -> str:
+    """The point nearest to another where the robot may be, as an advice; empty without any."""
+    centres = space.field.to_map(np.argwhere(space.free) + 0.5)
+    if not len(centres):
+        return ""
+    return f"; it fits at {text(centres[np.argmin(np.hypot(*(centres - xy).T))])}"
 
 
 def require_near(name: str, xy: np.ndarray, points: ArcPoints) -> None:
@@ -131,6 +137,6 @@ def require_near(name: str, xy: np.ndarray, points: ArcPoints) -> None:
     distance = np.hypot(*(on_arc - xy).T).min(initial=np.inf)
     if not distance <= MAX_STRAIGHT:
         raise ValueError(
-            f"{name} is at {text(xy)}, {distance:.1f} m from the nearest arc; without an occupancy "
-            f"map it may be {MAX_STRAIGHT:g} m"
+            f"{name} {text(xy)} is {distance:.1f} m from the nearest arc; without an occupancy map "
+            f"{MAX_STRAIGHT:g} m are allowed"
         )

@@ -14,15 +14,14 @@ from jaxslam.mapping.planner_data import doors_crossed, most_common, region_at
 SPACING = 0.05  # [m] between the points of a route whose clearance and region are taken
 AHEAD = 1.0  # [m] over which a heading is taken
 MIN_LENGTH = 1.0  # [m] of a leg that ends at a turn, or where a region begins without a door
-TURN = np.radians(40.0)  # from which on a leg ends at a junction
+TURN, BACK = np.radians(40.0), np.radians(150.0)  # turns that end a leg, and that go back
 
 
 class Leg(NamedTuple):
     """A part of a route, map frame.
 
     Attributes:
-        start: (2,) [m].
-        end: (2,) [m].
+        line: (n, 2) [m] polyline.
         length: [m].
         clearance: [m] distance to the nearest obstacle at its narrowest place; NaN if not known.
         heading: [rad] at its start.
@@ -34,8 +33,7 @@ class Leg(NamedTuple):
         arcs: Indices of the arcs that it follows, in order.
     """
 
-    start: np.ndarray
-    end: np.ndarray
+    line: np.ndarray
     length: float
     clearance: float
     heading: float
@@ -84,8 +82,7 @@ def split_into_legs(
         heading = _heading(fine, along, along[first], min(along[first] + AHEAD, along[last]))
         legs.append(
             Leg(
-                start=fine[first],
-                end=fine[last],
+                line=without_straight_points(fine[first : last + 1]),
                 length=float(along[last] - along[first]),
                 clearance=float(clearance[first : last + 1].min()),
                 heading=heading,
@@ -106,16 +103,37 @@ def followed(arc: np.ndarray) -> tuple[int, ...]:
     return tuple(arc[np.append(True, arc[1:] != arc[:-1])[: len(arc)]].tolist())
 
 
-def describe(leg: Leg) -> str:
-    """A leg as a line of text, as in `turn left, 3.2 m through corridor room_4 to door_2`."""
-    where = "" if leg.region is None else f" in {leg.region}"
-    if leg.region is not None and leg.region_kind not in (None, "room"):
-        where = f" along the {leg.region_kind} {leg.region}"
-    end = "" if leg.door is None else f" to the door {leg.door} ({leg.door_width:.2f} m wide)"
-    side = "left" if leg.turn > 0 else "right"
-    turn = f"turn {side}, " if abs(leg.turn) >= TURN else ""
-    turn = "turn back, " if abs(leg.turn) >= np.radians(150.0) else turn
-    return f"{turn}{leg.length:.1f} m{where}{end}"
+def describe(legs: tuple[Leg, ...], goal: str) -> list[str]:
+    """Legs as lines of text, as in `turn left, 3.2 m in room_4 to the door door_2 (0.91 m wide)`.
+
+    Args:
+        legs: All legs of a route.
+        goal: What the last one leads to.
+    """
+    lines: list[str] = []
+    for leg in legs:
+        where = "" if leg.region is None else f" in {leg.region}"
+        if leg.region_kind not in (None, "room"):
+            where = f" along the {leg.region_kind} {leg.region}"
+        end = "" if leg.door is None else f" to the door {leg.door} ({leg.door_width:.2f} m wide)"
+        turn = "" if lines else f"heading {np.degrees(leg.heading):.0f} deg, "
+        if abs(leg.turn) >= BACK:
+            turn = "turn back, "
+        elif abs(leg.turn) >= TURN:
+            turn = f"turn {'left' if leg.turn > 0 else 'right'}, "
+        lines.append(f"{turn}{leg.length:.1f} m{where}{end}")
+    lines[-1] += f" to {goal}"
+    return lines
+
+
+def without_straight_points(line: np.ndarray) -> np.ndarray:
+    """A polyline (n, 2) without the points where it goes straight on, or stays."""
+    line = line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-9)]
+    before, after = np.diff(line[:-1], axis=0), np.diff(line[1:], axis=0)
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    size = np.hypot(*before.T) * np.hypot(*after.T)
+    straight = (np.abs(cross) < 1e-6 * size) & (np.sum(before * after, axis=1) > 0)
+    return line[np.concatenate([[True], ~straight, [True]])] if len(line) > 2 else line
 
 
 def _clearances(

@@ -7,7 +7,7 @@ from jaxslam.core.regions import Regions
 from jaxslam.mapping.arc_points import ArcPoints
 from jaxslam.mapping.clearance import ClearanceField, widest_near
 from jaxslam.mapping.route_ends import Goal, text
-from jaxslam.mapping.route_search import REACHES, find_line, is_joined
+from jaxslam.mapping.route_search import find_line, is_joined
 
 PRECISION = 0.005  # [m] of the width of the narrowest place
 NEAR_DOOR = 0.5  # [m] from the middle of a door within which a narrow place is named after it
@@ -27,7 +27,7 @@ def reason(
         both = points._replace(directed=np.zeros_like(points.directed))
         if points.directed.any() and find_line(both, field, start, goal, robot_radius) is not None:
             return what + "one-way arcs lead in the other direction"
-        return what + f"one of them has no arc within {REACHES[-1]:g} m"
+        return what + "the arcs near the two are not joined"
     if not is_joined(points, field, start, goal, 0.0):
         return what + "they are in separate parts of the map"
     low, high = 0.0, robot_radius

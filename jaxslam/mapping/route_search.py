@@ -19,8 +19,8 @@ from jaxslam.mapping.free_paths import (
 )
 from jaxslam.mapping.route_ends import Goal
 
-REACHES = (5.0, 10.0, 20.0, 40.0)
-"""[m] from start and goal within which paths to arcs are searched, the next where one fails."""
+REACHES = (5.0, 10.0, 20.0, 40.0, 100.0)
+"""[m] from start and goal within which free paths are searched, the next where one fails."""
 
 
 class Access(NamedTuple):
@@ -61,16 +61,16 @@ def find_line(
         return None
     usable = _usable(points, robot_radius)
     if field is None:
-        first = _straight(points, usable, start, 1)
-        return _solve(points, robot_radius, first, _to_goal(points, usable, goal))
+        first = _straight(points, robot_radius, start, 1)
+        return _solve(points, robot_radius, first, _to_goal(points, robot_radius, goal))
     space = free_space(field, points, robot_radius)
     if goal.xy is not None and is_free(space, start, goal.xy[None], 1)[0]:
         return np.stack([start, goal.xy]), np.array([-1])
     for reach in REACHES:
         first = _through_space(space, points, usable, start, goal.xy, reach, 1)
-        last = _to_goal(points, usable, goal, space, reach)
+        last = _to_goal(points, robot_radius, goal, space, reach)
         found = _solve(points, robot_radius, first, last)
-        if found is not None:
+        if found is not None or reach >= max(field.free.shape) * field.resolution:
             return found
     return None
 
@@ -110,12 +110,16 @@ def _usable(points: ArcPoints, robot_radius: float) -> np.ndarray:
     return np.unique(points.edges[points.passable(robot_radius)])
 
 
-def _straight(points: ArcPoints, usable: np.ndarray, xy: np.ndarray, sign: int) -> Access:
-    """The straight line between a point (2,) [m] and the nearest point of an arc."""
-    distance = np.hypot(*(points.xy[usable] - xy).T)
-    nearest = usable[[np.argmin(distance)]]
-    line = np.stack([xy, points.xy[nearest[0]]])[::sign]
-    return Access(nearest, distance.min(keepdims=True), lambda _: line)
+def _straight(points: ArcPoints, robot_radius: float, xy: np.ndarray, sign: int) -> Access:
+    """The straight lines between a point (2,) [m] and the two ends of the nearest edge."""
+    edges = points.edges[points.passable(robot_radius)]
+    start, step = points.xy[edges[:, 0]], points.xy[edges[:, 1]] - points.xy[edges[:, 0]]
+    fraction = np.sum((xy - start) * step, axis=1) / np.maximum(np.sum(step**2, axis=1), 1e-12)
+    foot = start + np.clip(fraction, 0.0, 1.0)[:, None] * step
+    nearest = np.unique(edges[np.argmin(np.hypot(*(foot - xy).T))])
+    targets = points.xy[nearest]
+    length = np.hypot(*(targets - xy).T)
+    return Access(nearest, length, lambda k: np.stack([xy, targets[k]])[::sign])
 
 
 def _through_space(
@@ -138,7 +142,7 @@ def _through_space(
 
 def _to_goal(
     points: ArcPoints,
-    usable: np.ndarray,
+    robot_radius: float,
     goal: Goal,
     space: FreeSpace | None = None,
     reach: float = np.inf,
@@ -148,7 +152,8 @@ def _to_goal(
         targets = points.xy[goal.points]
         return Access(goal.points, np.zeros(len(targets)), lambda k: targets[[k]])
     if space is None:
-        return _straight(points, usable, goal.xy, -1)
+        return _straight(points, robot_radius, goal.xy, -1)
+    usable = _usable(points, robot_radius)
     return _through_space(space, points, usable, goal.xy, None, reach, -1)
 
 

@@ -82,15 +82,15 @@ def read_map_folder(path: str | PathLike) -> MapFolder:
     nodes = [*known.nodes, *_users_nodes(known)]
     for node in nodes:
         if not np.isfinite(node.xy).all():
-            problem = f"has no position in node {node.id}"
-            raise InputError(problem, path=folder / GRAPH, advice="give it two coordinates")
+            advice, field = "give it two coordinates", f"node {node.id}"
+            raise InputError("has no position", path=folder / GRAPH, field=field, advice=advice)
     index = {node.id: n for n, node in enumerate(nodes)}
     roads = [*_roads(known), *_users_roads(known, folder / GRAPH)]
     joined = [r for r in roads if r.edge.start in index and r.edge.end in index]
     notes = []
     if len(joined) < len(roads):
-        ends = len(roads) - len(joined)
-        notes.append(f"{ends} arcs of {GRAPH} end at no node, and are left out")
+        left_out = len(roads) - len(joined)
+        notes.append(f"arcs of {GRAPH} that end at no node are left out: {left_out}")
     occupancy = None
     if (folder / OCCUPANCY).exists():
         occupancy = ros_map.read(folder / OCCUPANCY)
@@ -171,8 +171,8 @@ def _users_roads(known: AnnotatedMap, path: Path) -> Iterator[_Road]:
             try:
                 line = line_points(geometry)
             except ValueError as error:
-                name = f"line {properties.get('id', number)}"
-                raise InputError(str(error), path=path, field=f"{name}, coordinates") from None
+                field = f"line {properties.get('id', number)}"
+                raise InputError(str(error), path=path, field=field) from None
             edges[start, end] = OldEdge(number, start, end, np.nan, line, properties)
     for (start, end), edge in edges.items():
         if start < end or (end, start) not in edges:

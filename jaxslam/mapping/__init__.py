@@ -9,7 +9,6 @@ from jaxslam.mapping.arc_table import grow_arcs as grow_arcs
 from jaxslam.mapping.grid_topology import GridTopology as GridTopology
 from jaxslam.mapping.grid_topology import extract_topology as extract_topology
 from jaxslam.mapping.occupancy import occupancy_map as occupancy_map
-from jaxslam.mapping.planner_data import planner_data as planner_data
 from jaxslam.mapping.planning import PlannedRoute as PlannedRoute
 from jaxslam.mapping.planning import drivable as drivable
 from jaxslam.mapping.planning import route as route

@@ -35,9 +35,16 @@ def reason(
         middle = 0.5 * (low + high)
         joined = is_joined(points, field, start, goal, middle)
         low, high = (middle, high) if joined else (low, middle)
-    where = _narrowest(points, field, start, goal, low, regions)
     if low == 0.0 and np.isnan(points.width).any() and field is None:
         return what + "the width of an arc to it is not known"
+    xy = _narrowest(points, field, start, goal, low)
+    where = "" if xy is None else f", at {text(xy)},"
+    for door in () if regions is None or xy is None else regions.doors:
+        if np.hypot(*(door.xy - xy)) <= NEAR_DOOR:
+            where = f", the door {door.name},"
+            if door.width < 2.0 * robot_radius:
+                is_wide = f"is {door.width:.2f} m wide"
+                return what + f"its door {door.name} {is_wide}, the robot {2 * robot_radius:.2f} m"
     return what + (
         f"its narrowest place{where} is {low:.2f} m from obstacles, and the robot needs "
         f"{robot_radius:.2f} m"
@@ -50,22 +57,16 @@ def _narrowest(
     start: np.ndarray,
     goal: Goal,
     robot_radius: float,
-    regions: Regions | None,
-) -> str:
-    """Where the route of the widest robot that passes is narrowest; empty if that is not known."""
+) -> np.ndarray | None:
+    """The point (2,) [m] where the route of a robot is narrowest, in any direction of travel."""
     both = points._replace(directed=np.zeros_like(points.directed))
     found = find_line(both, field, start, goal, robot_radius)
     if found is None:
-        return ""
+        return None
     line, arc = found
     if field is None:
         edge = np.flatnonzero(np.isin(points.arc, arc[arc >= 0]))
         edge = edge[[np.argmin(np.nan_to_num(points.width[edge], nan=0.0))]]
-        xy = points.xy[points.edges[edge[0]]].mean(axis=0)
-    else:
-        samples = polylines.refine(line, 0.05)
-        xy = samples[np.argmin(widest_near(field, samples))]
-    for door in () if regions is None else regions.doors:
-        if np.hypot(*(door.xy - xy)) <= NEAR_DOOR:
-            return f", the door {door.name},"
-    return f", at {text(xy)},"
+        return np.asarray(points.xy[points.edges[edge[0]]].mean(axis=0))
+    samples = polylines.refine(line, 0.05)
+    return np.asarray(samples[np.argmin(widest_near(field, samples))])

@@ -90,7 +90,7 @@ def is_joined(
     if field is None:
         if not usable.size:
             return False
-        near = usable[np.argmin(np.hypot(*(points.xy[usable][:, None] - ends).T), axis=1)]
+        near = [_nearest_edge(points, robot_radius, xy)[0] for xy in ends]
         joints = np.column_stack([near, [count, count + 1]])
     else:
         space = free_space(field, points._replace(directed=np.zeros(0, bool)), robot_radius)
@@ -112,14 +112,19 @@ def _usable(points: ArcPoints, robot_radius: float) -> np.ndarray:
 
 def _straight(points: ArcPoints, robot_radius: float, xy: np.ndarray, sign: int) -> Access:
     """The straight lines between a point (2,) [m] and the two ends of the nearest edge."""
+    nearest = _nearest_edge(points, robot_radius, xy)
+    targets = points.xy[nearest]
+    length = np.hypot(*(targets - xy).T)
+    return Access(nearest, length, lambda k: np.stack([xy, targets[k]])[::sign])
+
+
+def _nearest_edge(points: ArcPoints, robot_radius: float, xy: np.ndarray) -> np.ndarray:
+    """The two ends (2,) of the edge nearest to a point (2,) [m], of those wide enough."""
     edges = points.edges[points.passable(robot_radius)]
     start, step = points.xy[edges[:, 0]], points.xy[edges[:, 1]] - points.xy[edges[:, 0]]
     fraction = np.sum((xy - start) * step, axis=1) / np.maximum(np.sum(step**2, axis=1), 1e-12)
     foot = start + np.clip(fraction, 0.0, 1.0)[:, None] * step
-    nearest = np.unique(edges[np.argmin(np.hypot(*(foot - xy).T))])
-    targets = points.xy[nearest]
-    length = np.hypot(*(targets - xy).T)
-    return Access(nearest, length, lambda k: np.stack([xy, targets[k]])[::sign])
+    return np.asarray(edges[np.argmin(np.hypot(*(foot - xy).T))])
 
 
 def _through_space(

@@ -162,7 +162,10 @@ def is_free(space: FreeSpace, point: np.ndarray, others: np.ndarray, sign: int) 
         cells = np.floor(samples).astype(int)
         inside = np.all((cells >= 0) & (cells < space.free.shape), axis=2)
         cells = np.where(inside[..., None], cells, 0)
-        allowed = inside & space.free[cells[..., 0], cells[..., 1]]
+        i, j = cells[..., 0], cells[..., 1]
+        allowed = inside & space.free[i, j]
+        # Not between two cells that touch at a corner.
+        allowed[1:] &= space.free[i[1:], j[:-1]] & space.free[i[:-1], j[1:]]
         if space.directions is not None:
             step = sign * (others[first : first + chunk] - point)
             step /= np.maximum(np.hypot(*step.T), 1e-9)[:, None]

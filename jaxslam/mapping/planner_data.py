@@ -29,18 +29,19 @@ def planner_data(
     lines = graph.arc_lines
     widths = clearance_at(clearance_field(occupancy), np.concatenate([np.zeros((0, 2)), *lines]))
     last = np.cumsum([len(line) for line in lines], dtype=int)
-    arc_region = np.full(len(lines), -1)
-    doors: list[tuple[int, ...]] = [()] * len(lines)
-    for k, line in enumerate(lines if regions is not None else ()):
-        assert regions is not None
-        count = 1 + int(np.ceil(polylines.length(line) / SPACING))
-        arc_region[k] = most_common(region_at(regions, polylines.resample(line, count)))
-        doors[k] = tuple(door for _, door in doors_crossed(regions.doors, line))
+    node_region, arc_region = np.full(len(graph.xy), -1), np.full(len(lines), -1)
+    arc_doors: list[tuple[int, ...]] = [()] * len(lines)
+    if regions is not None:
+        node_region = region_at(regions, graph.xy)
+        for k, line in enumerate(lines):
+            count = 1 + int(np.ceil(polylines.length(line) / SPACING))
+            arc_region[k] = most_common(region_at(regions, polylines.resample(line, count)))
+            arc_doors[k] = tuple(door for _, door in doors_crossed(regions.doors, line))
     return PlannerData(
-        node_region=np.full(len(graph.xy), -1) if regions is None else region_at(regions, graph.xy),
+        node_region=node_region,
         arc_region=arc_region,
-        arc_doors=tuple(doors),
-        arc_widths=tuple(np.split(widths, last[:-1])) if len(lines) else (),
+        arc_doors=tuple(arc_doors),
+        arc_widths=tuple(np.split(widths, last[:-1])) if lines else (),
     )
 
 

@@ -127,8 +127,9 @@ def describe(legs: tuple[Leg, ...], goal: str) -> list[str]:
 
 
 def without_straight_points(line: np.ndarray) -> np.ndarray:
-    """A polyline (n, 2) without the points where it goes straight on, or stays."""
-    line = line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-9)]
+    """A polyline (n, 2) without the points where it goes straight on, or stays; two are left."""
+    moved = line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-9)]
+    line = moved if len(moved) > 1 else line[[0, -1]]
     before, after = np.diff(line[:-1], axis=0), np.diff(line[1:], axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     size = np.hypot(*before.T) * np.hypot(*after.T)

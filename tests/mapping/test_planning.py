@@ -193,6 +193,61 @@ def test_legs_follow_each_other_and_read_well():
     assert "turn left, " in " ".join(mirrored)
 
 
+def test_where_no_door_is_known_a_leg_ends_as_another_region_begins():
+    bare = floor.regions()._replace(doors=())
+    bare = bare._replace(regions=tuple(region._replace(doors=()) for region in bare.regions))
+    found = planned((8.0, 1.5), (2.5, 5.7), regions=bare)
+    assert [leg.region for leg in found.legs] == ["room_3", "room_1"]
+    assert floor_y(found.legs[0].line[-1]) == pytest.approx(3.2, abs=0.1)
+
+
+def test_a_leg_ends_where_the_route_turns_at_a_junction():
+    xy = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [9.0, 0.0]])
+    made = straight_graph(xy, [(0, 1), (1, 2), (1, 3)])
+    found = route(made, xy[0], xy[2])
+    assert [leg.length for leg in found.legs] == pytest.approx([4.0, 3.0])
+    assert [leg.turn for leg in found.legs] == pytest.approx([0.0, np.pi / 2])
+    assert [leg.arcs for leg in found.legs] == [(0,), (1,)]
+    assert describe(found.legs, "F") == ["heading 0 deg, 4.0 m", "turn left, 3.0 m to F"]
+    assert describe(route(made, xy[2], xy[0]).legs, "F")[1] == "turn right, 4.0 m to F"
+    assert len(route(made, xy[0], xy[3]).legs) == 1  # straight on
+
+
+def test_no_path_leads_between_two_cells_that_touch_at_a_corner():
+    free = np.zeros((30, 30), bool)
+    free[1:15, 1:15] = free[15:29, 15:29] = True  # these touch at one corner
+    free[27:29, 1:29] = free[1:29, 1:3] = True  # around the other corner
+    grid = OccupancyMap(~free, free, 0.1, np.zeros(3))
+    bare = straight_graph(np.zeros((0, 2)), np.zeros((0, 2), int))
+    found = route(bare, [1.35, 1.35], [1.65, 1.65], occupancy=grid, robot_radius=0.0)
+    assert found.length > 3.0
+
+
+@pytest.mark.parametrize("size, detour", [(1, False), (3, True)])
+def test_specks_of_noise_are_no_obstacles(size, detour):
+    grid = floor.occupancy()
+    grid.occupied[50 : 50 + size, 21 : 21 + size] = True
+    grid.free[50 : 50 + size, 21 : 21 + size] = False
+    found = planned((2.05, 2.15), (8.05, 2.15), occupancy=grid)
+    assert (found.length > 6.001) == detour
+    assert found.clearance > RADIUS - 0.05
+
+
+def test_arcs_far_from_the_start_are_found():
+    free = np.zeros((160, 60), bool)
+    free[1:159, 1:59] = True
+    free[1:150, 30] = False  # a wall; start and goal are on both sides of its left end
+    grid = OccupancyMap(~free, free, 0.1, np.zeros(3))
+    far = straight_graph(np.array([[15.4, 1.0], [15.4, 5.0]]), [(0, 1)])
+    found = route(far, [1.0, 2.0], [1.0, 4.0], occupancy=grid)
+    assert found.arcs == (0,) and 28.0 < found.length < 32.0
+
+
+def test_a_route_to_its_start_has_no_length():
+    found = planned((1.0, 5.0), (1.0, 5.0))
+    assert found.length == 0.0 and found.line.shape == (2, 2) and len(found.legs) == 1
+
+
 def test_without_an_occupancy_map_it_goes_straight_to_the_nearest_arc():
     made = straight_graph(np.array([[0.0, 0.0], [10.0, 0.0]]), [(0, 1)])
     found = route(made, [2.0, 0.3], [8.0, -0.4])

@@ -1,4 +1,4 @@
-"""The command line: `jaxslam simulate`, `run`, `localise`, `map` and `tune`."""
+"""The command line: `jaxslam simulate`, `run`, `localise`, `map`, `route` and `tune`."""
 
 import inspect
 import re
@@ -12,6 +12,7 @@ import jaxslam
 from jaxslam.cli import deprecated
 from jaxslam.cli.localise_command import localise_in_map
 from jaxslam.cli.map_command import map_occupancy
+from jaxslam.cli.route_command import plan_route
 from jaxslam.cli.run_command import run
 from jaxslam.cli.simulate_command import simulate
 from jaxslam.cli.tune_command import tune
@@ -25,6 +26,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "run": run,
     "localise": localise_in_map,
     "map": map_occupancy,
+    "route": plan_route,
     "tune": tune,
 }
 

@@ -22,6 +22,7 @@ from jaxslam.io.output import write_json, write_text
 from jaxslam.io.route_graph import route_graph
 from jaxslam.localisation.config import LocaliseInfo
 from jaxslam.mapping import pose_graph
+from jaxslam.mapping.planning import PlannedRoute
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.results import SlamResult
@@ -268,6 +269,31 @@ def draw_map(path: Path, occupancy: OccupancyMap, graph: TopologicalMap) -> None
     figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
     maps.draw_occupancy(axis, occupancy)
     maps.draw_topological_map(axis, graph)
+    canvas.legend(figure)
+    figure.savefig(path)
+
+
+def draw_route(
+    path: Path,
+    graph: TopologicalMap,
+    planned: PlannedRoute,
+    *,
+    occupancy: OccupancyMap | None = None,
+    regions: Regions | None = None,
+) -> None:
+    """Draw a route over a topological map, and over the occupancy map and the rooms if known."""
+    # Imported here, because matplotlib is slow to import.
+    from jaxslam.viz import canvas, maps, routes
+
+    corners = np.zeros((0, 2)) if occupancy is None else maps.known_corners(occupancy)
+    figure, axis = canvas.map_canvas(*canvas.extent(corners, graph.xy, planned.line))
+    if occupancy is not None:
+        maps.draw_occupancy(axis, occupancy)
+    if regions is not None:
+        routes.draw_regions(axis, regions)
+    maps.draw_arcs(axis, graph)
+    routes.draw_route(axis, planned)
+    maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
     canvas.legend(figure)
     figure.savefig(path)
 

@@ -111,6 +111,19 @@ def print_map_summary(numbers: Metrics, title: str, out: Path) -> None:
     print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, map.graphml")
 
 
+def print_route_summary(numbers: Metrics, title: str, legs: Sequence[str], out: Path) -> None:
+    """Print the legs of a route and a summary of its `metrics.json`."""
+    print(f"\n{title}")
+    for number, leg in enumerate(legs, start=1):
+        print(f"  {number}. {leg}")
+    lengths = f"{numbers['length_m']:10.1f}{numbers['straight_m']:10.1f}"
+    print(f"  {'length, straight line [m]':34}{lengths}")
+    narrowest = numbers["narrowest_m"]
+    text = f"{narrowest:10.2f}" if np.isfinite(narrowest) else f"{'not known':>10}"
+    print(f"  {'smallest clearance [m]':34}{text}")
+    print(f"results: {out}{os.sep}route.json, route.png, metrics.json")
+
+
 def _print_seconds(numbers: Metrics) -> None:
     seconds = numbers["seconds"]
     print(f"  {'run time, compile time [s]':34}{seconds['run']:10.1f}{seconds['compile']:10.1f}")

@@ -63,6 +63,23 @@ def _interpolate(xp: Any, line: Any, at_point: Any, wanted: Any) -> Any:
     return xp.stack([xp.interp(wanted, at_point, line[:, axis]) for axis in range(2)], axis=1)
 
 
+def refine(line: np.ndarray, spacing: float, least: int = 1) -> np.ndarray:
+    """A polyline (n, 2) [m] with more points on its segments, `spacing` [m] apart or less.
+
+    Args:
+        line: (n >= 2, 2) [m].
+        spacing: [m].
+        least: Number of pieces that each segment is cut into, at least.
+    """
+    pieces = np.ceil(np.hypot(*np.diff(line, axis=0).T) / spacing)
+    pieces = np.maximum(pieces, least).astype(int)
+    segment = np.repeat(np.arange(len(pieces)), pieces)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    fraction = (number / pieces[segment])[:, None]
+    points = line[segment] + fraction * (line[segment + 1] - line[segment])
+    return np.concatenate([points, line[-1:]])
+
+
 def project(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nearest points on a polyline.
 

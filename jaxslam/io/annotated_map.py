@@ -40,11 +40,15 @@ class OldNode(NamedTuple):
         id: Landmark id.
         kind: Kind of landmark.
         properties: Those of the user.
+        xy: [m, map frame], NaN if the file has no such numbers.
+        clearance: [m], NaN if the file has none.
     """
 
     id: int
     kind: str
     properties: Mapping[str, Any]
+    xy: tuple[float, float] = (math.nan, math.nan)
+    clearance: float = math.nan
 
 
 class OldEdge(NamedTuple):
@@ -58,6 +62,7 @@ class OldEdge(NamedTuple):
         line: (n >= 2, 2) [m, map frame] from start to end; None if the file has none, as one that
             nav2_route saved.
         properties: Those of the user.
+        clearance: [m], NaN if the file has none.
     """
 
     id: int
@@ -66,6 +71,7 @@ class OldEdge(NamedTuple):
     length: float
     line: np.ndarray | None
     properties: Mapping[str, Any]
+    clearance: float = math.nan
 
 
 class OldArc(NamedTuple):
@@ -130,7 +136,8 @@ def read(path: str | PathLike, kinds: Collection[str] = KINDS) -> AnnotatedMap |
         if geometry.get("type") == "Point" and metadata.get("kind") in list(kinds):
             node_id = _id(where, feature, properties)
             own_properties = _of_user(properties, NODE_KEYS, NODE_METADATA)
-            nodes.append(OldNode(node_id, metadata["kind"], own_properties))
+            xy, clearance = position(geometry), _length(metadata.get("clearance"))
+            nodes.append(OldNode(node_id, metadata["kind"], own_properties, xy, clearance))
         elif geometry.get("type") in (*LINES, None) and metadata.get("arc") is not None:
             node_id = _id(where, feature, properties)
             arc = _number(where, "properties.metadata.arc", metadata["arc"])
@@ -244,13 +251,18 @@ def _edge(
     metadata: Mapping[str, Any],
 ) -> OldEdge:
     """One direction of an arc."""
+    try:
+        line = line_points(geometry)
+    except ValueError as error:
+        raise where.error("geometry.coordinates", str(error)) from None
     return OldEdge(
         id=edge_id,
         start=_number(where, "properties.startid", properties.get("startid")),
         end=_number(where, "properties.endid", properties.get("endid")),
         length=_length(metadata.get("length")),
-        line=_line(where, geometry),
+        line=line,
         properties=_of_user(properties, EDGE_KEYS, EDGE_METADATA),
+        clearance=_length(metadata.get("clearance")),
     )
 
 
@@ -260,8 +272,21 @@ def _length(value: Any) -> float:
     return float(value) if known else math.nan
 
 
-def _line(where: _Place, geometry: Mapping[str, Any]) -> np.ndarray | None:
-    """Points (n, 2) [m] of a line or of lines one after the other."""
+def position(geometry: Mapping[str, Any]) -> tuple[float, float]:
+    """Position [m] of a Point, NaN if it has no such numbers."""
+    try:
+        x, y = (float(value) for value in geometry["coordinates"][:2])
+    except (TypeError, ValueError, KeyError, OverflowError):
+        return math.nan, math.nan
+    return (x, y) if max(abs(x), abs(y)) < MAX_COORDINATE else (math.nan, math.nan)
+
+
+def line_points(geometry: Mapping[str, Any]) -> np.ndarray | None:
+    """Points (n, 2) [m] of a line or of lines one after the other, None without any.
+
+    Raises:
+        ValueError: They are no points.
+    """
     lines = geometry.get("coordinates")
     if not lines:
         return None
@@ -271,7 +296,7 @@ def _line(where: _Place, geometry: Mapping[str, Any]) -> np.ndarray | None:
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):
         line = np.zeros(0)
     if len(line) < 2 or not (np.abs(line) < MAX_COORDINATE).all():
-        raise where.error("geometry.coordinates", "are no points of a line")
+        raise ValueError("are no points of a line")
     return line
 
 

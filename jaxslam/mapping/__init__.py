@@ -9,6 +9,9 @@ from jaxslam.mapping.arc_table import grow_arcs as grow_arcs
 from jaxslam.mapping.grid_topology import GridTopology as GridTopology
 from jaxslam.mapping.grid_topology import extract_topology as extract_topology
 from jaxslam.mapping.occupancy import occupancy_map as occupancy_map
+from jaxslam.mapping.planning import PlannedRoute as PlannedRoute
+from jaxslam.mapping.planning import drivable as drivable
+from jaxslam.mapping.planning import route as route
 from jaxslam.mapping.pose_graph import PoseGraph as PoseGraph
 from jaxslam.mapping.pose_graph import build_pose_graph as build_pose_graph
 from jaxslam.mapping.routes import Route as Route

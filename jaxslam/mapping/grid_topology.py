@@ -22,6 +22,7 @@ from jaxslam.core.types import JUNCTION, as_float64, check_array
 from jaxslam.mapping import medial_axis
 from jaxslam.mapping.cell_graph import CellGraph, trace_cells
 from jaxslam.mapping.cell_graph_cleanup import clean_up
+from jaxslam.mapping.clearance import obstacle_distance
 from jaxslam.mapping.medial_axis import FreeConfigurations
 from jaxslam.mapping.plane_graph import Line, PlaneGraph
 
@@ -199,8 +200,7 @@ def _to_map(
 def _smallest_clearance(line: np.ndarray, foot: np.ndarray) -> float:
     """Smallest distance [cells] from a polyline to the edge of an obstacle.
 
-    The polyline is sampled every quarter of a cell. The nearest obstacle of a sample is taken to be
-    one of those of the four cells around it.
+    The polyline is sampled every quarter of a cell.
 
     Args:
         line: (n, 2) [cells].
@@ -208,8 +208,5 @@ def _smallest_clearance(line: np.ndarray, foot: np.ndarray) -> float:
     """
     at_point = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     wanted = np.unique(np.concatenate([at_point, np.arange(0.0, at_point[-1], 0.25)]))
-    samples = np.stack([np.interp(wanted, at_point, line[:, axis]) for axis in range(2)])
-    row, column = np.floor(samples).astype(int)
-    row, column = row + np.array([[0], [0], [1], [1]]), column + np.array([[0], [1], [0], [1]])
-    row, column = np.minimum(row, foot.shape[1] - 1), np.minimum(column, foot.shape[2] - 1)
-    return float(np.hypot(*(foot[:, row, column] - samples[:, None])).min()) - 0.5
+    samples = np.column_stack([np.interp(wanted, at_point, line[:, axis]) for axis in range(2)])
+    return float(obstacle_distance(samples, foot).min())

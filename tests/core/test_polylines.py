@@ -45,3 +45,14 @@ def test_numpy_and_jax_resample_alike_and_jax_traces():
         np.testing.assert_allclose(points, polylines.resample(line), atol=1e-12)
         distance, _ = polylines.project(np.asarray(points), line)
         np.testing.assert_allclose(distance, 0.0, atol=1e-9)
+
+
+def test_a_refined_polyline_keeps_its_points_and_has_no_long_steps():
+    line = np.array([[0.0, 0.0], [0.35, 0.0], [0.35, 0.05], [0.35, 0.05]])
+    fine = polylines.refine(line, 0.1)
+    step = np.hypot(*np.diff(fine, axis=0).T)
+    assert step.max() <= 0.1 and step.sum() == pytest.approx(0.4)
+    assert len(fine) == 1 + 4 + 1 + 1
+    for point in line:
+        assert (np.abs(fine - point).max(axis=1) < 1e-12).any()
+    assert len(polylines.refine(line, 9.0, 3)) == 10

@@ -38,7 +38,9 @@ class CellGraph(NamedTuple):
     arcs: dict[int, CellArc]
 
 
-def trace_cells(cells: np.ndarray, clearance: np.ndarray) -> CellGraph:
+def trace_cells(
+    cells: np.ndarray, clearance: np.ndarray, also: np.ndarray | None = None
+) -> CellGraph:
     """Graph of thin cells.
 
     Every cell whose number of neighbours is not two belongs to a node. From each neighbour of a
@@ -54,6 +56,7 @@ def trace_cells(cells: np.ndarray, clearance: np.ndarray) -> CellGraph:
     Args:
         cells: (H, W) bool, one cell thin.
         clearance: (H, W) [cells] distance to the nearest obstacle.
+        also: (H, W) bool, cells that are nodes too.
     """
     index = np.argwhere(cells)
     number = np.full(np.add(cells.shape, 2), -1)  # of each cell, -1 for none; padded
@@ -61,6 +64,9 @@ def trace_cells(cells: np.ndarray, clearance: np.ndarray) -> CellGraph:
     height = clearance[tuple(index.T)]
     neighbours = _neighbours(number)
     node_of = _node_cells(number, neighbours, height)
+    if also is not None:
+        for cell in np.flatnonzero(also[tuple(index.T)]).tolist():
+            node_of.setdefault(cell, cell)
     cell_graph = CellGraph({node: index[node] for node in node_of.values()}, {})
     visited: set[int] = set()
 

@@ -1,5 +1,7 @@
 """Clean-up of a cell graph: spurs dropped, arcs joined, close junctions merged."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from jaxslam.mapping.cell_graph import CellArc, CellGraph, make_arc
@@ -8,6 +10,7 @@ from jaxslam.mapping.cell_graph import CellArc, CellGraph, make_arc
 CORNER_SPUR_FACTOR = 1.6
 # Junctions closer than this fraction of the smaller of their clearances are merged.
 MERGE_FRACTION = 0.5
+SAME_JUNCTION = 4.0  # [cells] to a node that stays, within which a node is the same
 
 
 def arcs_at_nodes(cell_graph: CellGraph) -> dict[int, list[int]]:
@@ -19,7 +22,7 @@ def arcs_at_nodes(cell_graph: CellGraph) -> dict[int, list[int]]:
     return arcs_at
 
 
-def clean_up(cell_graph: CellGraph, clearance: np.ndarray) -> None:
+def clean_up(cell_graph: CellGraph, clearance: np.ndarray, kept: Collection[int] = ()) -> None:
     """Drop short spurs, join arcs through nodes of degree 2, merge junctions; until all is stable.
 
         repeat
@@ -35,17 +38,18 @@ def clean_up(cell_graph: CellGraph, clearance: np.ndarray) -> None:
     Args:
         cell_graph: The graph; changed in place.
         clearance: (H, W) [cells] distance to the nearest obstacle.
+        kept: Nodes that stay, whatever arcs they have.
     """
     before = None
     while before != len(cell_graph.arcs):
         before = len(cell_graph.arcs)
-        while drop_spurs(cell_graph, clearance):
-            _join_through(cell_graph)
-        _join_through(cell_graph)
-        _merge_junctions(cell_graph, clearance)
+        while drop_spurs(cell_graph, clearance, kept):
+            _join_through(cell_graph, kept)
+        _join_through(cell_graph, kept)
+        _merge_junctions(cell_graph, clearance, kept)
 
 
-def drop_spurs(cell_graph: CellGraph, clearance: np.ndarray) -> bool:
+def drop_spurs(cell_graph: CellGraph, clearance: np.ndarray, kept: Collection[int] = ()) -> bool:
     """Drop spurs no longer than the clearance at their root, or into a corner; was any dropped?
 
     A spur into a corner loses clearance at a constant rate along its length: it is no longer than
@@ -55,6 +59,7 @@ def drop_spurs(cell_graph: CellGraph, clearance: np.ndarray) -> bool:
     Args:
         cell_graph: The graph; changed in place.
         clearance: (H, W) [cells] distance to the nearest obstacle.
+        kept: Nodes that are no tips of spurs.
     """
     arcs_at = arcs_at_nodes(cell_graph)
     short: dict[int, int] = {}  # tip of each short spur
@@ -67,18 +72,19 @@ def drop_spurs(cell_graph: CellGraph, clearance: np.ndarray) -> bool:
             arc.ends, key=lambda node: (len(arcs_at[node]) > 1, height(node)), reverse=True
         )
         limit = max(height(root), CORNER_SPUR_FACTOR * (height(root) - height(tip)))
-        if root != tip and len(arcs_at[tip]) == 1 and arc.length <= limit:
+        is_spur = root != tip and len(arcs_at[tip]) == 1 and tip not in kept
+        if is_spur and arc.length <= limit:
             short[k] = tip
     for k, tip in short.items():
         del cell_graph.arcs[k], cell_graph.nodes[tip]
     return bool(short)
 
 
-def _join_through(cell_graph: CellGraph) -> None:
+def _join_through(cell_graph: CellGraph, kept: Collection[int]) -> None:
     """Replace the two arcs at each node of degree 2 by one; loops stay."""
     arcs_at = arcs_at_nodes(cell_graph)
     for node, at_node in arcs_at.items():
-        if len(at_node) != 2 or at_node[0] == at_node[1]:
+        if len(at_node) != 2 or at_node[0] == at_node[1] or node in kept:
             continue
         first, second = at_node
         to_node = _ending_at(cell_graph.arcs[first], node)
@@ -90,7 +96,7 @@ def _join_through(cell_graph: CellGraph) -> None:
         del cell_graph.arcs[second], cell_graph.nodes[node]
 
 
-def _merge_junctions(cell_graph: CellGraph, clearance: np.ndarray) -> None:
+def _merge_junctions(cell_graph: CellGraph, clearance: np.ndarray, stay: Collection[int]) -> None:
     """Merge junctions joined by an arc much shorter than their clearances.
 
     The junction with the larger clearance is kept; the other arcs of the lost one are extended to
@@ -109,10 +115,11 @@ def _merge_junctions(cell_graph: CellGraph, clearance: np.ndarray) -> None:
 
     for k in sorted(cell_graph.arcs, key=lambda k: (cell_graph.arcs[k].length, k)):
         arc = cell_graph.arcs[k]
-        lost, kept = sorted(arc.ends, key=lambda node: (height(node), -node))
+        lost, kept = sorted(arc.ends, key=lambda node: (node in stay, height(node), -node))
         if lost == kept or arc.length > MERGE_FRACTION * height(lost):
             continue
-        if len(arcs_at[lost]) < 3 or len(arcs_at[kept]) < 3:
+        is_same = arc.length <= SAME_JUNCTION and kept in stay
+        if not is_same and (lost in stay or len(arcs_at[lost]) < 3 or len(arcs_at[kept]) < 3):
             continue
         extension = _ending_at(arc, lost).cells  # from the kept node to the lost one
         arcs_at[lost].remove(k)

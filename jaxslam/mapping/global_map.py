@@ -14,6 +14,7 @@ that is a landmark has its id, and any other that of the node of the map before 
 after it has moved with the scans around it (`landmark_nodes.kept_ids`).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.se2_np import compose, relative
 from jaxslam.core.types import CORNER, JUNCTION
 from jaxslam.mapping import grid_topology, medial_axis
+from jaxslam.mapping.diagram_junctions import corner_junctions
 from jaxslam.mapping.landmark_nodes import kept_ids, place_landmarks
 from jaxslam.mapping.medial_axis import FreeConfigurations
 from jaxslam.mapping.open_space import FreeSpace, fill_open_space
@@ -67,6 +69,7 @@ def build_global_map(
     *,
     previous: TopologicalMap | None = None,
     robot_radius: float = ROBOT_RADIUS,
+    with_corner_junctions: bool = False,
 ) -> GlobalMap:
     """The topological map of a grid that scans were drawn into.
 
@@ -78,6 +81,8 @@ def build_global_map(
         previous: An earlier map of the same place, its nodes moved with the poses; nodes that are
             still there keep their ids.
         robot_radius: [m] see `ROBOT_RADIUS`.
+        with_corner_junctions: Whether junctions with a branch into a corner are nodes too, as in
+            the paper; landmarks elsewhere are then none. A planner does not need them.
 
     Returns:
         The map. Where no pose lies in free space, `merged` as it is.
@@ -96,11 +101,21 @@ def build_global_map(
     reached = _reached(space, occupancy, poses)
     if not reached.any():
         return GlobalMap(merged, occupancy, next_id)
-    cell_graph = grid_topology.trace_medial_axis(space, occupancy.occupied, reached)
+    find = None
+    if with_corner_junctions:
+        find = partial(corner_junctions, occupancy, free, space)
+    cell_graph, kept = grid_topology.trace_medial_axis(
+        space, occupancy.occupied, reached, find_junctions=find
+    )
     graph = grid_topology.to_plane(cell_graph, resolution, corner)
     place = FreeSpace(space.distance * resolution * reached, resolution, corner, robot_radius)
     junctions = np.flatnonzero(merged.kind == JUNCTION)
-    landmarks = place_landmarks(graph, merged.xy[junctions], merged.clearance[junctions], place)
+    known = None
+    if with_corner_junctions:
+        known = [n for n, node in enumerate(cell_graph.nodes) if node in kept]
+    landmarks = place_landmarks(
+        graph, merged.xy[junctions], merged.clearance[junctions], place, known
+    )
     fill_open_space(graph, place)
     xy = np.array(graph.xy)
     ids = np.full(len(xy), -1)

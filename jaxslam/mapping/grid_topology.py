@@ -99,7 +99,7 @@ def extract_topology(
         raise ValueError(f"has no free space for a robot with robot_radius = {robot_radius:g} m")
     count = 1 if min_region_area is None else max(1, int(np.sum(areas >= min_region_area)))
     chosen = (space.region > 0) & (space.region <= count)
-    cell_graph = trace_medial_axis(space, occupied, chosen, callback)
+    cell_graph, _ = trace_medial_axis(space, occupied, chosen, callback)
     graph = _to_map(cell_graph, space, resolution, origin)
     return GridTopology(graph, count, float(areas[:count].sum()), float(areas[count:].sum()))
 
@@ -124,7 +124,8 @@ def trace_medial_axis(
     occupied: np.ndarray,
     chosen: np.ndarray,
     callback: Callable[[str], object] = str,
-) -> CellGraph:
+    find_junctions: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> tuple[CellGraph, set[int]]:
     """The medial cells of some regions as a graph, cleaned up.
 
     Args:
@@ -132,15 +133,24 @@ def trace_medial_axis(
         occupied: (H, W) bool.
         chosen: (H, W) bool, the cells of the regions.
         callback: As of `extract_topology`; called with the last two of the `STAGES`.
+        find_junctions: From medial cells (H, W) bool to those (H, W) that are nodes in any case;
+            by default, none.
+
+    Returns:
+        The graph, and its nodes at such cells.
     """
     wall = ndimage.binary_dilation(occupied, structure=np.ones((3, 3)), iterations=UNKNOWN_MARGIN)
     anchors = medial_axis.between_walls(space, wall, angle=DEAD_END_ANGLE) & chosen
     callback(STAGES[1])
     cells = medial_axis.medial_cells(space, chosen, anchors)
     callback(STAGES[2])
-    cell_graph = trace_cells(cells, space.distance)
-    clean_up(cell_graph, space.distance)
-    return cell_graph
+    also = None if find_junctions is None else find_junctions(cells)
+    cell_graph = trace_cells(cells, space.distance, also)
+    kept = set()
+    if also is not None:
+        kept = {node for node, cell in cell_graph.nodes.items() if also[tuple(cell)]}
+    clean_up(cell_graph, space.distance, kept)
+    return cell_graph, kept & cell_graph.nodes.keys()
 
 
 def to_plane(cell_graph: CellGraph, resolution: float, corner: np.ndarray) -> PlaneGraph:

@@ -1,5 +1,7 @@
 """Which nodes of a diagram are which landmarks, and the ids of all nodes."""
 
+from collections.abc import Collection
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -16,7 +18,11 @@ CONTRADICTED = 0.5
 
 
 def place_landmarks(
-    graph: PlaneGraph, xy: np.ndarray, clearance: np.ndarray, space: FreeSpace
+    graph: PlaneGraph,
+    xy: np.ndarray,
+    clearance: np.ndarray,
+    space: FreeSpace,
+    junctions: Collection[int] | None = None,
 ) -> dict[int, int]:
     """Make landmarks nodes of a diagram, in place.
 
@@ -32,6 +38,8 @@ def place_landmarks(
         xy: (L, 2) [m] landmarks, in the order of their ids.
         clearance: (L,) [m] radii of their circles.
         space: Free configurations, in which the diagram lies.
+        junctions: Nodes that are junctions though they join two arcs. Where these are given, they
+            are all there are: a landmark that is at no node is no node.
 
     Returns:
         Landmark, by the number of its node.
@@ -40,7 +48,7 @@ def place_landmarks(
     left = space.at(xy) if len(xy) else np.zeros(0)
     usable = np.flatnonzero((left > 0.0) & (left >= CONTRADICTED * clearance))
     radius = np.minimum(SAME_NODE, 0.5 * clearance)
-    ends = np.flatnonzero(graph.degrees() != 2)
+    ends = np.union1d(np.flatnonzero(graph.degrees() != 2), list(junctions or ())).astype(int)
     pairs = []
     if len(ends) and len(usable):
         tree = cKDTree(np.array(graph.xy)[ends])
@@ -54,7 +62,7 @@ def place_landmarks(
             names[node] = k
             placed.add(k)
             _move(graph, node, xy[k], space)
-    for k in usable.tolist():
+    for k in usable.tolist() if junctions is None else ():
         if k in placed:
             continue
         arc, distance, along = graph.nearest(xy[k], float(clearance[k]))

@@ -47,7 +47,7 @@ def test_both_labels_keep_what_the_paper_says_of_corridors():
 def test_ten_scans_of_a_room_give_the_voronoi_graph_of_its_walls():
     """Figures 8 and 9, with a draw of the noise that the picture is not of."""
     walls = np.asarray(worlds.named(fig09_global.WORLD).walls)
-    maps, _, _ = fig09_global.explore(worlds.scan_poses(fig09_global.WORLD), walls, seed=3)
+    maps, *_ = fig09_global.explore(worlds.scan_poses(fig09_global.WORLD), walls, seed=3)
     result = fig09_global.compare(maps[-1], reference(walls))
     assert fig09_global.equal(result), result
     assert result["worst_node_error_m"] < fig09_global.NEAR

@@ -5,7 +5,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from jaxslam.core.scan import Lidar
+from jaxslam.core.scan import Lidar, Scan
 from jaxslam.frontend import lidar
 from jaxslam.io import ros_map
 from jaxslam.mapping import occupancy
@@ -97,3 +97,20 @@ def test_a_map_is_read_back_by_its_reader_and_by_others(found, tmp_path):
     assert shade.shape == found.free.shape[::-1]
     i, j = np.argwhere(found.occupied)[0]
     assert shade[shade.shape[0] - 1 - j, i] == 0
+
+
+def test_space_between_beams_is_free_where_they_are_near_each_other():
+    """A wall at 8 m, by beams 4 degrees apart: their gap is a cell at 0.7 m, `MAX_GAP` at 2.9 m."""
+    sparse = Lidar(num_beams=21, angle_min=-np.pi / 9, angle_increment=np.pi / 45, range_max=20.0)
+    angle = sparse.angle_min + sparse.angle_increment * np.arange(21)
+    scan = Scan(8.0 / np.cos(angle)[None], np.ones((1, 21), bool))
+    grid = occupancy.occupancy_map(sparse, np.zeros((1, 3)), scan, resolution=0.05)
+    centre = (np.argwhere(grid.free) + 0.5) * 0.05 + grid.origin[:2]
+    bearing = np.arctan2(*centre.T[::-1])
+    from_beam = np.abs(bearing[:, None] - angle).min(axis=1) * np.hypot(*centre.T)
+    between = from_beam > 0.06
+    reach = occupancy.MAX_GAP / sparse.angle_increment
+    assert np.hypot(*centre[between].T).max() < reach + 0.1
+    x, y = np.meshgrid(np.arange(0.8, 2.7, 0.05), np.arange(-0.2, 0.2, 0.05))
+    index = np.floor((np.stack([x, y], -1).reshape(-1, 2) - grid.origin[:2]) / 0.05).astype(int)
+    assert grid.free[tuple(index.T)].mean() > 0.97

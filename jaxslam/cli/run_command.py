@@ -39,8 +39,10 @@ from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.errors import InputError
 from jaxslam.io.map_file import load_map
 from jaxslam.io.output import folder
+from jaxslam.mapping.config import MappingSpec
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline import log_input, sessions
+from jaxslam.pipeline.config import MAPPING
 from jaxslam.pipeline.log_input import LogInput, OdometrySource
 from jaxslam.pipeline.online import ChunkResult, SlamState
 from jaxslam.pipeline.results import SlamResult
@@ -64,6 +66,8 @@ def run(
     scanner: Scanner = ScannerOptions(),  # noqa: B008
     pose_frame: Literal["scanner", "base"] = "scanner",
     scan: OptionalCount = None,
+    robot_radius: float = MAPPING.robot_radius,
+    topology: Literal["grid", "merged"] = "grid",
     gif: bool = False,
     rerun: Annotated[
         Literal["live", "file"] | None,
@@ -107,11 +111,16 @@ def run(
         pose_frame: Whose poses trajectory.tum holds: those of the scanner, or of the robot (base).
         scan: Number of a scan, from 0, whose local Voronoi diagram is drawn: scan.png.
         gif: Write an animation of the run: run.gif.
+        robot_radius: Robot radius [m]: the topological map has no arcs through space narrower than
+            twice this, but where the robot drove.
+        topology: The topological map is the Voronoi diagram of all scans at their poses (grid), or
+            diagrams of single scans, merged without a grid, as in the paper (merged).
         rerun: Show the run in the rerun viewer while it is processed (live), or write run.rrd for
             it (file); needs the extra [view].
         strict: Exit with code 3 if the map contradicts itself; all results are still written.
         out: Folder for the results.
     """
+    check_range("--robot-radius", robot_radius, 0.01, 100.0)
     logs = [_read(path, scanner, odometry, scan_topic, odometry_topic) for path in log]
     if not logs:
         raise InputError("is missing", field="LOG", advice="name one log, or several")
@@ -144,6 +153,8 @@ def run(
             sessions.check_saved_map(earlier, given.config.frontend.lidar)
             if not match_scans:
                 raise ValueError("a map is continued by scans: not with --odometry wheels")
+    mapping = MappingSpec(topology, robot_radius)
+    given = given._replace(config=given.config._replace(mapping=mapping))
     config, scans = given.config, given.scans
     if scan is not None:
         check_range("--scan", scan, 0, len(given.increments) - 1)

@@ -38,7 +38,7 @@ def clean_up(cell_graph: CellGraph, clearance: np.ndarray, kept: Collection[int]
     Args:
         cell_graph: The graph; changed in place.
         clearance: (H, W) [cells] distance to the nearest obstacle.
-        kept: Nodes that stay, whatever arcs they have.
+        kept: Names of nodes that stay, whatever arcs they have.
     """
     before = None
     while before != len(cell_graph.arcs):
@@ -59,7 +59,7 @@ def drop_spurs(cell_graph: CellGraph, clearance: np.ndarray, kept: Collection[in
     Args:
         cell_graph: The graph; changed in place.
         clearance: (H, W) [cells] distance to the nearest obstacle.
-        kept: Nodes that are no tips of spurs.
+        kept: Names of nodes that are no tips of spurs.
     """
     arcs_at = arcs_at_nodes(cell_graph)
     short: dict[int, int] = {}  # tip of each short spur

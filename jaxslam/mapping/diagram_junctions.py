@@ -22,7 +22,7 @@ MIN_FOOT_ANGLE = 0.6
 """[rad] between two feet, as of a trusted junction of a scan (`FeatureSpec`)."""
 
 TOUCH = 1.3
-"""[cells] by which two feet of one circle may differ in distance: what a grid cannot tell."""
+"""[cells] by which two feet of one circle may differ in distance, for the size of the cells."""
 
 SNAP = 4.0
 """[cells] from a cell where branches meet, within which it is the same junction."""

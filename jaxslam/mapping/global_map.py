@@ -34,9 +34,6 @@ from jaxslam.mapping.open_space import FreeSpace, fill_open_space
 RESOLUTION = 0.05
 """[m] side of the cells of the grid."""
 
-ROBOT_RADIUS = 0.2
-"""[m] space narrower than twice this has no arcs, but where the robot drove."""
-
 MIN_SHARE = 0.01
 """Of the poses: a region of free space with fewer of them is not mapped."""
 
@@ -68,7 +65,7 @@ def build_global_map(
     next_id: int,
     *,
     previous: TopologicalMap | None = None,
-    robot_radius: float = ROBOT_RADIUS,
+    robot_radius: float = 0.2,
     with_corner_junctions: bool = False,
 ) -> GlobalMap:
     """The topological map of a grid that scans were drawn into.
@@ -80,7 +77,7 @@ def build_global_map(
         next_id: Id of the next node.
         previous: An earlier map of the same place, its nodes moved with the poses; nodes that are
             still there keep their ids.
-        robot_radius: [m] see `ROBOT_RADIUS`.
+        robot_radius: [m] space narrower than twice this has no arcs, but where the robot drove.
         with_corner_junctions: Whether junctions with a branch into a corner are nodes too, as in
             the paper; landmarks elsewhere are then none. A planner does not need them.
 

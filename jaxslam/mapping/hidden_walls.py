@@ -18,7 +18,7 @@ from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.scan import Lidar, Scan
 
 DEPTH = 0.3
-"""[m] from free space, up to which unknown space is judged."""
+"""[m] from free space, up to which unknown space is divided so."""
 
 REACH = 0.6
 """[m] from a point of a wall, up to which the wall goes on."""

@@ -38,7 +38,7 @@ def place_landmarks(
         xy: (L, 2) [m] landmarks, in the order of their ids.
         clearance: (L,) [m] radii of their circles.
         space: Free configurations, in which the diagram lies.
-        junctions: Nodes that are junctions though they join two arcs. Where these are given, they
+        junctions: Numbers of nodes that are junctions though they join two arcs. If given, these
             are all there are: a landmark that is at no node is no node.
 
     Returns:

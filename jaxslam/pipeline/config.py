@@ -9,6 +9,7 @@ from jaxslam.filtering.config import FilterConfig
 from jaxslam.frontend import config as frontend_config
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import field_of_view
+from jaxslam.mapping.config import MappingSpec, check_mapping_spec
 from jaxslam.matching.checks import check_scan_match_spec
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.map_places import JoinSpec, check_join_spec
@@ -18,9 +19,9 @@ from jaxslam.pipeline import keyframes
 MAX_LANDMARKS = 2048  # default capacity for landmarks: a building with some kilometres of corridors
 LOG_CONFIRM_COUNT = 3  # real buildings have clutter that looks like a landmark once or twice
 LOG_KEYFRAME_DISTANCE = (0.3, 0.3)  # [m], [rad] little of a scanner's view changes over it
-TOPOLOGIES = ("grid", "merged")
 FRONTEND, FILTER = FrontendConfig(), FilterConfig()  # the defaults
 SCAN_MATCHING, LOOP_CLOSURE, JOINING = ScanMatchSpec(), LoopClosureSpec(), JoinSpec()
+MAPPING = MappingSpec()
 
 
 class Config(NamedTuple):
@@ -37,9 +38,7 @@ class Config(NamedTuple):
             log a keyframe, if it exceeds one of both; other scans are only matched. None: every
             scan is a keyframe, as where more than half of them would be.
         joining: How pieces of a broken drive are joined.
-        topology: How `run_slam` makes its topological map: `"grid"`, the Voronoi diagram of all
-            scans at their poses (`mapping.global_map`), or `"merged"`, the paper's: diagrams of
-            single scans, merged without a grid (`mapping.topological_map`).
+        mapping: How the topological map is made at the end of a log.
     """
 
     frontend: FrontendConfig = FRONTEND
@@ -48,7 +47,7 @@ class Config(NamedTuple):
     loop_closure: LoopClosureSpec = LOOP_CLOSURE
     keyframe_distance: tuple[float, float] | None = None
     joining: JoinSpec = JOINING
-    topology: str = "grid"
+    mapping: MappingSpec = MAPPING
 
     @classmethod
     def for_lidar(
@@ -128,9 +127,7 @@ class Config(NamedTuple):
         check_loop_closure_spec(self.loop_closure)
         check_join_spec(self.joining)
         keyframes.check_distance(self.keyframe_distance)
-        if self.topology not in TOPOLOGIES:
-            known = " or ".join(map(repr, TOPOLOGIES))
-            raise ValueError(f"config.topology is {self.topology!r}, not {known}")
+        check_mapping_spec(self.mapping)
         own, scanner = self.filter.field_of_view, field_of_view(self.frontend.lidar)
         if own != scanner:
             raise ValueError(

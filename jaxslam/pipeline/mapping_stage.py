@@ -19,7 +19,7 @@ from jaxslam.pipeline.results import SlamResult
 def with_maps(
     config: Config, scans: Scan, result: SlamResult, saved: SavedMap | None
 ) -> SlamResult:
-    """A result with its occupancy map and its topological map as `config.topology` says.
+    """A result with its occupancy map, and its topological map as `config.mapping` says.
 
     A map of several drives loses arcs on which the last scans see obstacles, with a note.
 
@@ -43,9 +43,14 @@ def with_maps(
         drives.insert(0, result.saved_poses)
     occupancy = occupancy_map(lidar, poses, own, resolution=RESOLUTION)
     notes, next_id = result.notes, int(result.belief.next_id)
-    if config.topology == "grid":
+    if config.mapping.topology == "grid":
         found = build_global_map(
-            occupancy, trajectories_as_one(drives), graph, next_id, previous=previous
+            occupancy,
+            trajectories_as_one(drives),
+            graph,
+            next_id,
+            previous=previous,
+            robot_radius=config.mapping.robot_radius,
         )
         graph, occupancy, next_id = found
     if len(drives) > 1:

@@ -1,0 +1,89 @@
+"""Outer boundaries of labelled cells, as polygons."""
+
+import numpy as np
+from scipy import ndimage
+
+from jaxslam.core import polylines
+
+TOLERANCE = 0.9  # [cells] of a polygon
+
+
+def outlines(label: np.ndarray, count: int) -> list[np.ndarray]:
+    """Outer boundary (n, 2) [cells] of each of the labels 1 to `count`, counter-clockwise.
+
+    The largest part of a label is outlined if it has several; its holes are not. Cell [i, j] is the
+    square from (i, j) to (i + 1, j + 1).
+
+    Args:
+        label: (H, W) int.
+        count: Number of labels; each has a cell.
+    """
+    found = []
+    for k, box in enumerate(ndimage.find_objects(label, count), start=1):
+        corner = np.array([side.start for side in box])
+        found.append(_simplified(_boundary(np.pad(label[box] == k, 1))) + corner - 1.0)
+    return found
+
+
+def _boundary(cells: np.ndarray) -> np.ndarray:
+    """Corners (n, 2) of the largest outer boundary of cells (H, W) bool; the border is not set.
+
+    Each side of a cell whose neighbour is not set is an edge with the cell on its left. Where two
+    cells meet in a corner alone, the boundary stays with its cell:
+
+        # .         a turn to the left wherever there is a choice
+        . #
+    """
+    height, width = cells.shape
+    moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # each turned left from the one before
+    beside = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]])  # neighbour on the right of each edge
+    starts = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # corner of the cell where it begins
+    edge_at = np.zeros((4, height + 1, width + 1), bool)
+    for turn in range(4):
+        row, column = np.nonzero(cells & ~np.roll(cells, -beside[turn], axis=(0, 1)))
+        edge_at[turn, row + starts[turn, 0], column + starts[turn, 1]] = True
+    turns, rows, columns = np.nonzero(edge_at)
+    number = np.full(edge_at.shape, -1)
+    number[turns, rows, columns] = np.arange(len(turns))
+    ends = np.stack([rows, columns], axis=1) + moves[turns]
+    follower = np.full(len(turns), -1)
+    for change in (-1, 0, 1):  # right, straight on, left: the last one found is taken
+        nxt = number[(turns + change) % 4, ends[:, 0], ends[:, 1]]
+        follower = np.where(nxt >= 0, nxt, follower)
+    largest, area = np.zeros(0, int), 0.0
+    following, seen = follower.tolist(), np.zeros(len(turns), bool)
+    for first in range(len(turns)):
+        loop, edge = [], first
+        while not seen[edge]:
+            seen[edge] = True
+            loop.append(edge)
+            edge = following[edge]
+        inside = float(np.sum(columns[loop] * -moves[turns[loop], 0]))  # negative of a hole
+        if inside > area:
+            largest, area = np.array(loop), inside
+    is_corner = turns[largest] != np.roll(turns[largest], 1)
+    return np.stack([rows, columns], axis=1)[largest[is_corner]].astype(float)
+
+
+def _simplified(polygon: np.ndarray) -> np.ndarray:
+    """Polygon of fewer corners, at most `TOLERANCE` from the given one (n, 2).
+
+    References:
+        Douglas, Peucker (1973), Algorithms for the reduction of the number of points required to
+        represent a digitized line or its caricature.
+    """
+    first = int(np.lexsort(polygon.T[::-1])[0])
+    loop = np.roll(polygon, -first, axis=0)
+    loop = np.concatenate([loop, loop[:1]])
+    middle = int(np.hypot(*(loop - loop[0]).T).argmax())
+    kept, pieces = {0, middle}, [(0, middle), (middle, len(loop) - 1)]
+    while pieces:
+        start, stop = pieces.pop()
+        if stop - start < 2:
+            continue
+        away = polylines.project(loop[start + 1 : stop], loop[[start, stop]])[0]
+        if away.max() > TOLERANCE:
+            furthest = start + 1 + int(away.argmax())
+            kept.add(furthest)
+            pieces += [(start, furthest), (furthest, stop)]
+    return loop[sorted(kept)]

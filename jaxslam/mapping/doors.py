@@ -21,6 +21,7 @@ HALL_RATIO = 2.5  # width of a hall, at least, relative to a corridor that ends 
 HALL_RANGE = 2.5  # widths of the corridor within which the hall is so wide
 _HALL_RAYS = np.radians(np.arange(-75.0, 76.0, 15.0))
 _STEP = 0.7  # [cells] along lines
+_BATCH = 64  # gaps that are looked at together
 
 
 def find_doors(
@@ -36,20 +37,24 @@ def find_doors(
     """
     passages = Passages(find_gaps(free, distance, nearest))
     widths = passages.gaps.width
-    tried = narrowest(passages, max_width=MAX_WIDTH / resolution, wall=WALL / resolution).tolist()
+    tried = narrowest(passages, max_width=MAX_WIDTH / resolution, wall=WALL / resolution)
     search = _Search(free, passages, resolution)
+    # Closing doors makes space narrower: what does not widen now never does.
+    widens = [search.widens(batch) for batch in np.array_split(tried, len(tried) // _BATCH + 1)]
+    both, either = np.concatenate(widens).all(axis=1), np.concatenate(widens).any(axis=1)
     doors = []
-    for k in tried:
-        if all(search.widens(k)):
+    for k in tried[both].tolist():
+        if search.is_door(k):
             search.close(k)
             doors.append(k)
     for k in sorted(doors, key=lambda k: (-widths[k], k)):
         search.open(k)  # it may have widened through a door that was found later
-        if all(search.widens(k)):
+        if search.is_door(k):
             search.close(k)
         else:
             doors.remove(k)
-    for k in sorted(set(tried) - set(doors), key=lambda k: (widths[k], k)):
+    is_door = np.isin(tried, doors)
+    for k in tried[either & ~is_door].tolist():
         end = search.hall_end(k, distance)
         if end is not None:
             search.close(k)
@@ -64,53 +69,71 @@ class _Search:
         """Begin with all doors open."""
         self._passages = passages
         self._gaps = passages.gaps
-        self._obstacles = (~free).astype(np.int16)  # number of obstacles in each cell
+        self._normal = passages.gaps.normal
         self._wall = WALL / resolution
         self._ahead = np.arange(1.0, REACH / resolution + 0.5)  # [cells]
+        # The margin holds all points that are looked up.
+        self._margin = int(HALL_RANGE * MAX_WIDTH / resolution) + 2
+        # Number of obstacles in each cell, doors included.
+        self._obstacles = np.pad((~free).astype(np.int16), self._margin, constant_values=1)
         self._frames: dict[int, np.ndarray] = {}
 
     def close(self, k: int) -> None:
         """Fill the gap k and its door frame."""
-        self._obstacles[self._frame(k)] += 1
+        self._obstacles.reshape(-1)[self._frame(k)] += 1
 
     def open(self, k: int) -> None:
         """Undo `close`."""
-        self._obstacles[self._frame(k)] -= 1
+        self._obstacles.reshape(-1)[self._frame(k)] -= 1
 
-    def _frame(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Cells of a gap and of those beside it in the same passage, as an index."""
+    def _frame(self, k: int) -> np.ndarray:
+        """Cells (n,) of a gap and of those beside it in the same passage, as flat indices."""
         if k not in self._frames:
             beside = self._passages.beside(k, self._wall)
             lines = [line_cells(self._gaps.feet[other]) for other in beside]
-            self._frames[k] = np.unique(np.concatenate(lines), axis=0).T
-        row, column = self._frames[k]
-        return row, column
+            row, column = np.concatenate(lines).T + self._margin
+            self._frames[k] = np.unique(row * self._obstacles.shape[1] + column)
+        return self._frames[k]
 
-    def _is_free(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (..., 2) [cells] are free: bool (...)."""
-        cells = np.clip(np.rint(points).astype(np.int64), 0, np.array(self._obstacles.shape) - 1)
-        return self._obstacles[cells[..., 0], cells[..., 1]] == 0
+    def _is_free(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Whether points [cells] are free."""
+        rows = np.rint(row).astype(np.int64) + self._margin
+        columns = np.rint(column).astype(np.int64) + self._margin
+        return self._obstacles.reshape(-1)[rows * self._obstacles.shape[1] + columns] == 0
 
-    def widens(self, k: int) -> list[bool]:
-        """Whether free space is wider than gap k on its two sides, in the direction of its normal.
+    def is_door(self, k: int) -> bool:
+        """Whether free space is wider than gap k on both its sides."""
+        return bool(self.widens(np.array([k])).all())
+
+    def widens(self, chosen: np.ndarray) -> np.ndarray:
+        """Whether free space is wider than gaps on their two sides.
 
         It is if for half of the distances within `REACH`, the line at that distance parallel to the
         gap is at least `WIDENING` times as long.
+
+        Args:
+            chosen: (n,) indices of gaps.
+
+        Returns:
+            (n, 2) bool, in front of the normals and behind them.
         """
         gaps, ahead = self._gaps, self._ahead
-        middle, along, normal = gaps.middle[k], gaps.along[k], gaps.normal[k]
-        needed = WIDENING * gaps.width[k]
-        steps = np.arange(0.0, needed + 1.0, _STEP)[:, None]
-        answer = []
-        for forward in (normal, -normal):
-            centres = middle + ahead[:, None] * forward
-            centres = centres[np.logical_and.accumulate(self._is_free(centres))]
-            length = np.zeros(len(centres))
-            for sideways in (along, -along):
-                is_free = self._is_free(centres[:, None] + steps * sideways)
-                length += _STEP * np.logical_and.accumulate(is_free, axis=1).sum(axis=1)
-            answer.append(bool(np.sum(length >= needed) >= 0.5 * len(ahead)))
-        return answer
+        needed = WIDENING * gaps.width[chosen]
+        if not len(chosen):
+            return np.zeros((0, 2), bool)
+        steps = np.arange(0.0, needed.max() + 1.0, _STEP)
+        # axes: gap, side, distance ahead, direction along the gap, step
+        forward = self._normal[chosen][:, None] * np.array([1.0, -1.0])[:, None]
+        centre = gaps.middle[chosen][:, None, None] + ahead[:, None] * forward[:, :, None]
+        along = gaps.along[chosen][:, None] * np.array([1.0, -1.0])[:, None]
+        offset = along[:, None, None, :, None] * steps[:, None]
+        row, column = np.moveaxis(centre[:, :, :, None, None] + offset, -1, 0)
+        is_free = self._is_free(row, column)
+        reached = np.logical_and.accumulate(is_free[..., 0, 0], axis=2)
+        blocked = ~is_free
+        count = np.where(blocked.any(axis=-1), blocked.argmax(axis=-1), len(steps))
+        wide = _STEP * count.sum(axis=-1) >= needed[:, None, None]
+        return (wide & reached).sum(axis=2) >= 0.5 * len(ahead)
 
     def hall_end(self, k: int, distance: np.ndarray) -> int | None:
         """The gap where the corridor of gap k ends in a hall, or None if it does not end there.
@@ -119,17 +142,17 @@ class _Search:
         the other side the corridor goes on for its own width.
         """
         gaps = self._gaps
-        ahead_side, back_side = self.widens(k)
-        if ahead_side == back_side:
+        in_front, behind = self.widens(np.array([k]))[0]
+        if in_front == behind:
             return None
         middle, width = gaps.middle[k], gaps.width[k]
-        normal = gaps.normal[k] if ahead_side else -gaps.normal[k]
-        back = np.arange(1.0, width + 1.0)[:, None]
-        if not self._is_free(middle - back * normal).all():
+        normal = self._normal[k] if in_front else -self._normal[k]
+        back = middle - np.arange(1.0, width + 1.0)[:, None] * normal
+        if not self._is_free(*back.T).all():
             return None
         rays = np.cos(_HALL_RAYS)[:, None] * normal + np.sin(_HALL_RAYS)[:, None] * gaps.along[k]
         points = middle + np.arange(1.0, HALL_RANGE * width + 1.0)[:, None] * rays[:, None]
-        seen = np.logical_and.accumulate(self._is_free(points), axis=1)
+        seen = np.logical_and.accumulate(self._is_free(points[..., 0], points[..., 1]), axis=1)
         cells = np.rint(points[seen]).astype(np.int64)
         if 2.0 * distance[tuple(cells.T)].max(initial=0.0) < HALL_RATIO * width:
             return None

@@ -3,9 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-from jaxslam.core import polylines
-
-TOLERANCE = 0.9  # [cells] of a polygon
+TOLERANCE = 1.0  # [cells] of a polygon
 
 
 def outlines(label: np.ndarray, count: int) -> list[np.ndarray]:
@@ -51,7 +49,7 @@ def _boundary(cells: np.ndarray) -> np.ndarray:
         nxt = number[(turns + change) % 4, ends[:, 0], ends[:, 1]]
         follower = np.where(nxt >= 0, nxt, follower)
     largest, area = np.zeros(0, int), 0.0
-    following, seen = follower.tolist(), np.zeros(len(turns), bool)
+    following, seen = follower.tolist(), [False] * len(turns)
     for first in range(len(turns)):
         loop, edge = [], first
         while not seen[edge]:
@@ -81,9 +79,16 @@ def _simplified(polygon: np.ndarray) -> np.ndarray:
         start, stop = pieces.pop()
         if stop - start < 2:
             continue
-        away = polylines.project(loop[start + 1 : stop], loop[[start, stop]])[0]
+        away = _distances(loop[start + 1 : stop], loop[start], loop[stop])
         if away.max() > TOLERANCE:
             furthest = start + 1 + int(away.argmax())
             kept.add(furthest)
             pieces += [(start, furthest), (furthest, stop)]
     return loop[sorted(kept)]
+
+
+def _distances(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distances (n,) of points (n, 2) from the segment between two points (2,)."""
+    step, offset = end - start, points - start
+    share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+    return np.hypot(offset[:, 0] - share * step[0], offset[:, 1] - share * step[1])

@@ -20,8 +20,8 @@ from jaxslam.mapping.gaps import Gaps, take
 from jaxslam.mapping.region_merging import divide
 from jaxslam.mapping.region_outline import outlines
 
-FURNITURE_SIZE = 0.8  # [m] of a free-standing obstacle that divides no room
-MIN_AREA = 1.0  # [m^2] of a region
+FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
+MIN_AREA = 1.5  # [m^2] of a region
 CORRIDOR_LENGTH = 3.0  # length of a corridor, at least, relative to its largest width
 HALL_AREA = 50.0  # [m^2] of a hall, at least
 

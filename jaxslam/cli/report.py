@@ -16,7 +16,7 @@ from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, map_file, ros_map, rooms_file, tum
+from jaxslam.io import g2o_writer, geojson, graphml, map_file, rooms_file, ros_map, tum
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
 from jaxslam.io.geojson import KINDS, Arc, Node

@@ -140,9 +140,7 @@ class _Reader:
             self._names(items, key, last)
             for items, key, last in zip(rows, ("regions", "doors"), numbers, strict=True)
         )
-        doors = tuple(
-            self._door(item, f"doors[{k}]", names) for k, item in enumerate(rows[1])
-        )
+        doors = tuple(self._door(item, f"doors[{k}]", names) for k, item in enumerate(rows[1]))
         regions = tuple(
             self._region(item, k, names, door_names, doors) for k, item in enumerate(rows[0])
         )

@@ -24,7 +24,7 @@ MODES = ("trinary", "scale", "raw")
 UNKNOWN_SHADE, FREE_SHADE = 205, 254  # [0, 255] that map_saver writes; 254 and 255 are free
 UNKNOWN_PROBABILITY = 1 - UNKNOWN_SHADE / 255
 THRESHOLDS = (0.196, 0.65)  # free below, occupied above; the shade 205 is just above the first
-PICTURES = (".png", ".pgm", ".pbm", ".ppm", ".pnm", ".bmp", ".jpg", ".jpeg", ".gif", ".tif", ".tiff")
+PICTURES = tuple(".png .pgm .pbm .ppm .pnm .bmp .jpg .jpeg .gif .tif .tiff".split())
 FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 

@@ -1,8 +1,8 @@
 """Gaps of free space: straight lines between two walls that face each other.
 
-Where the medial axis passes between two walls, its two nearest obstacle cells (feet) lie on opposite
-sides of it. The line between the two feet is a gap. Doors and the ends of corridors are gaps that
-are narrow for what lies beside them (`doors`).
+Where the medial axis passes between two walls, its two nearest obstacle cells (feet) lie on
+opposite sides of it. The line between the two feet is a gap. Doors and the ends of corridors are
+gaps that are narrow for what lies beside them (`doors`).
 """
 
 from typing import NamedTuple

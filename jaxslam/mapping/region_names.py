@@ -29,8 +29,7 @@ def named(found: Regions, previous: Regions | None = None) -> Regions:
     door_numbers = [number_of(door.name) for door in old.doors]
     last_room = max([old.last_numbers[0], *room_numbers])
     last_door = max([old.last_numbers[1], *door_numbers])
-    sizes = [-region.area for region in found.regions]
-    order = np.lexsort((np.arange(len(sizes)), sizes))
+    order = np.argsort([-region.area for region in found.regions], kind="stable")
     rooms = _numbers(_same_regions(found, old), room_numbers, last_room, order.tolist())
     found = _sorted_regions(found, rooms)
     ends = [(door.regions, *door.xy.tolist()) for door in found.doors]

@@ -1,5 +1,7 @@
 """Rooms, corridors and halls of an occupancy map, and the doors between them.
 
+The steps of `find_regions`:
+
     free space, small free-standing obstacles (furniture) filled
     -> gaps between walls that face each other (`gaps`), the doors among them (`doors`)
     -> parts between doors, small ones merged (`region_merging`) -> outlines (`region_outline`)
@@ -22,7 +24,9 @@ from jaxslam.mapping.region_outline import outlines
 
 FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
 MIN_AREA = 1.5  # [m^2] of a region
+MIN_CLOSED_AREA = 5.0  # [m^2] of a region without a door
 CORRIDOR_LENGTH = 3.0  # length of a corridor, at least, relative to its largest width
+OUTSIDE_SHARE = 0.5  # of the border of a grid that lies outside, more than
 HALL_AREA = 50.0  # [m^2] of a hall, at least
 
 
@@ -37,9 +41,10 @@ def find_regions(
 ) -> Regions:
     """Divide the free space of an occupancy map into regions at its doors.
 
-    A region is free space in which the robot fits, at least `MIN_AREA` large, whether or not the
-    robot fits through its doors. Small free-standing obstacles belong to the region around them
-    (not to its area). Free space that reaches all four sides of the grid is outside, no region.
+    A region is free space in which the robot fits, at least `MIN_AREA` large (`MIN_CLOSED_AREA`
+    without a door), whether or not the robot fits through its doors. Small free-standing obstacles
+    belong to the region around them, but not to its area. Free space along most of the border of
+    the grid is outside, no region.
 
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
@@ -54,8 +59,8 @@ def find_regions(
         ValueError: An argument has another type, shape or range.
 
     References:
-        Bormann, Jordan, Li, Hampp, Haegele (2016), Room segmentation: survey, implementation, and
-        analysis. Mielle, Magnusson, Lilienthal (2018), A method to segment maps from different
+        Bormann, Jordan, Li, Hampp, Haegele (2016), on room segmentation, ICRA: the problem and its
+        benchmark. Mielle, Magnusson, Lilienthal (2018), A method to segment maps from different
         modalities using free space layout.
     """
     occupied, free = np.asarray(occupied), np.asarray(free)
@@ -66,12 +71,10 @@ def find_regions(
         if not 0.0 < size < np.inf:
             raise ValueError(f"{name} is {size}, not a positive number of metres")
     label = np.zeros(free.shape, np.int32)
-    empty = Regions(label, (), (), resolution, origin)
-    free = free & ~occupied
-    boxes = ndimage.find_objects(free.astype(np.int8))
-    if not boxes:
-        return region_names.named(empty, previous)
-    box = boxes[0]
+    free = np.asarray(free & ~occupied)
+    if not free.any():
+        return region_names.named(Regions(label, (), (), resolution, origin), previous)
+    (box,) = ndimage.find_objects(free.astype(np.int8))
     space, distance, nearest = _space(occupied[box], free[box], resolution)
     gaps = find_doors(space, distance, nearest, resolution=resolution)
     cells, sides = divide(
@@ -81,18 +84,18 @@ def find_regions(
         min_area=MIN_AREA / resolution**2,
         min_radius=robot_radius / resolution,
     )
-    inside = cells[1:-1, 1:-1]
-    if inside.shape == label.shape:
-        sides = _without_outside(inside, sides)
-    label[box] = inside
+    kept = _has_door(cells, sides, MIN_CLOSED_AREA / resolution**2)
+    label[box] = cells[1:-1, 1:-1]
+    kept &= ~_is_outside(label, len(kept))
+    number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
+    label, cells, sides = number[label], number[cells], number[sides]
     corner = np.array([side.start for side in box])
     gaps = gaps._replace(feet=gaps.feet - 1 + corner, middle=gaps.middle - 1.0 + corner)
     radius = ndimage.maximum(distance, cells, np.arange(1, cells.max(initial=0) + 1))
     area = np.bincount(label[free], minlength=len(radius) + 1)[1:] * resolution**2
-    regions = empty._replace(
-        regions=_regions(label, area, np.asarray(radius) * resolution, resolution, origin)
-    )
-    return region_names.named(_with_doors(regions, gaps, sides), previous)
+    regions = _regions(label, area, np.asarray(radius) * resolution, resolution, origin)
+    found = Regions(label, regions, (), resolution, origin)
+    return region_names.named(_with_doors(found, gaps, sides), previous)
 
 
 def _space(
@@ -111,18 +114,30 @@ def _space(
     return space, distance - 0.5, nearest
 
 
-def _without_outside(label: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Take the region that reaches all four sides out of `label`, in place, and out of `sides`."""
-    borders = (label[0], label[-1], label[:, 0], label[:, -1])
-    outside = set.intersection(*(set(np.unique(b).tolist()) for b in borders)) - {0}
-    if not outside:
-        return sides
-    number = np.arange(label.max() + 1)
-    number[list(outside)] = 0
-    kept = number > 0
-    number[kept] = np.arange(1, kept.sum() + 1)
-    label[:] = number[label]
-    return number[sides]
+def _has_door(label: np.ndarray, sides: np.ndarray, min_area: float) -> np.ndarray:
+    """Which labels (L + 1,) have a door, `min_area` cells without one, or are the largest; not 0.
+
+    Smaller ones are the insides of furniture, or what was seen through glass.
+
+    Args:
+        label: (H, W) int.
+        sides: (K, 2) labels on the two sides of each gap.
+        min_area: [cells]
+    """
+    area = np.bincount(label.ravel())
+    area[0] = 0
+    kept = (area >= min_area) | (area == area.max())
+    kept[sides[(sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])].ravel()] = True
+    kept[0] = False
+    return kept
+
+
+def _is_outside(label: np.ndarray, count: int) -> np.ndarray:
+    """Which labels (count,) lie along most of the border of the grid; not 0."""
+    border = np.concatenate([label[0], label[-1], label[1:-1, 0], label[1:-1, -1]])
+    outside = np.bincount(border, minlength=count) > OUTSIDE_SHARE * len(border)
+    outside[0] = False
+    return outside
 
 
 def _to_map(points: np.ndarray, resolution: float, origin: np.ndarray) -> np.ndarray:
@@ -142,9 +157,7 @@ def _regions(
     for k, polygon in enumerate(outlines(label, len(area))):
         long = area[k] >= CORRIDOR_LENGTH * (2.0 * radius[k]) ** 2
         kind = "corridor" if long else "hall" if area[k] >= HALL_AREA else "room"
-        found.append(
-            Region("", kind, _to_map(polygon, resolution, origin), float(area[k]), (), ())
-        )
+        found.append(Region("", kind, _to_map(polygon, resolution, origin), float(area[k]), (), ()))
     return tuple(found)
 
 

@@ -17,6 +17,7 @@ WIDENING = 1.25  # of free space beside a door, at least, relative to the width 
 REACH = 1.0  # [m] to each side of a gap in which space widens: walls are thinner
 WALL = 0.4  # [m] to each side of a door that may belong to its frame
 MAX_WIDTH = 6.0  # [m] of an opening between two regions
+MIN_CORRIDOR = 0.6  # [m] width of a corridor
 HALL_RATIO = 2.5  # width of a hall, at least, relative to a corridor that ends there
 HALL_RANGE = 2.5  # widths of the corridor within which the hall is so wide
 _HALL_RAYS = np.radians(np.arange(-75.0, 76.0, 15.0))
@@ -40,10 +41,10 @@ def find_doors(
     tried = narrowest(passages, max_width=MAX_WIDTH / resolution, wall=WALL / resolution)
     search = _Search(free, passages, resolution)
     # Closing doors makes space narrower: what does not widen now never does.
-    widens = [search.widens(batch) for batch in np.array_split(tried, len(tried) // _BATCH + 1)]
-    both, either = np.concatenate(widens).all(axis=1), np.concatenate(widens).any(axis=1)
+    widens = search.widens(tried)
+    tried = tried[widens.any(axis=1)]
     doors = []
-    for k in tried[both].tolist():
+    for k in tried[widens[widens.any(axis=1)].all(axis=1)].tolist():
         if search.is_door(k):
             search.close(k)
             doors.append(k)
@@ -53,8 +54,8 @@ def find_doors(
             search.close(k)
         else:
             doors.remove(k)
-    is_door = np.isin(tried, doors)
-    for k in tried[either & ~is_door].tolist():
+    tried = tried[~np.isin(tried, doors) & (widths[tried] >= MIN_CORRIDOR / resolution)]
+    for k in tried[search.widens(tried).any(axis=1)].tolist():
         end = search.hall_end(k, distance)
         if end is not None:
             search.close(k)
@@ -103,7 +104,7 @@ class _Search:
 
     def is_door(self, k: int) -> bool:
         """Whether free space is wider than gap k on both its sides."""
-        return bool(self.widens(np.array([k])).all())
+        return bool(self._widens(np.array([k])).all())
 
     def widens(self, chosen: np.ndarray) -> np.ndarray:
         """Whether free space is wider than gaps on their two sides.
@@ -117,10 +118,15 @@ class _Search:
         Returns:
             (n, 2) bool, in front of the normals and behind them.
         """
+        found = [np.zeros((0, 2), bool)]
+        for first in range(0, len(chosen), _BATCH):
+            found.append(self._widens(chosen[first : first + _BATCH]))
+        return np.concatenate(found)
+
+    def _widens(self, chosen: np.ndarray) -> np.ndarray:
+        """As `widens`, for few gaps of similar width."""
         gaps, ahead = self._gaps, self._ahead
         needed = WIDENING * gaps.width[chosen]
-        if not len(chosen):
-            return np.zeros((0, 2), bool)
         steps = np.arange(0.0, needed.max() + 1.0, _STEP)
         # axes: gap, side, distance ahead, direction along the gap, step
         forward = self._normal[chosen][:, None] * np.array([1.0, -1.0])[:, None]
@@ -142,7 +148,7 @@ class _Search:
         the other side the corridor goes on for its own width.
         """
         gaps = self._gaps
-        in_front, behind = self.widens(np.array([k]))[0]
+        in_front, behind = self._widens(np.array([k]))[0]
         if in_front == behind:
             return None
         middle, width = gaps.middle[k], gaps.width[k]

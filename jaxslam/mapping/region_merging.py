@@ -35,12 +35,19 @@ def divide(
     part, count = ndimage.label(free & ~is_cut)
     sides = _sides(part, lines, gaps)
     area = np.bincount(part.ravel(), minlength=count + 1)
-    radius = np.zeros(count + 1)
-    radius[1:] = ndimage.maximum(distance, part, np.arange(1, count + 1)) if count else 0.0
+    radius = largest(distance, part, count)
     region = _merged(sides, gaps.width, area, radius, min_area, min_radius)
     label = region[part]
     _fill_cuts(label, np.argwhere(is_cut))
     return label, region[sides]
+
+
+def largest(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
+    """Largest of some values (H, W) >= 0 in each label (count + 1,); 0 for the label 0."""
+    found = np.zeros(count + 1)
+    inside = label > 0
+    np.maximum.at(found, label[inside], values[inside])
+    return found
 
 
 def _sides(part: np.ndarray, lines: list[np.ndarray], gaps: Gaps) -> np.ndarray:

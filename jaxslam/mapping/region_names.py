@@ -59,6 +59,8 @@ def _numbers(
 
 def _same_regions(found: Regions, old: Regions) -> dict[int, int]:
     """Index of the earlier region that each region is, where there is one."""
+    if not old.regions:
+        return {}
     earlier = _rasterised(old, found)
     both = found.label.astype(np.int64) * (len(old.regions) + 1) + earlier
     counts = np.bincount(

@@ -19,12 +19,14 @@ def outlines(label: np.ndarray, count: int) -> list[np.ndarray]:
     found = []
     for k, box in enumerate(ndimage.find_objects(label, count), start=1):
         corner = np.array([side.start for side in box])
-        found.append(_simplified(_boundary(np.pad(label[box] == k, 1))) + corner - 1.0)
+        cells, parts = ndimage.label(np.pad(label[box] == k, 1))
+        largest = np.bincount(cells.ravel())[1:].argmax() + 1 if parts > 1 else 1
+        found.append(_simplified(_boundary(cells == largest)) + corner - 1.0)
     return found
 
 
 def _boundary(cells: np.ndarray) -> np.ndarray:
-    """Corners (n, 2) of the largest outer boundary of cells (H, W) bool; the border is not set.
+    """Corners (n, 2) of the outer boundary of connected cells (H, W) bool; the border is not set.
 
     Each side of a cell whose neighbour is not set is an edge with the cell on its left. Where two
     cells meet in a corner alone, the boundary stays with its cell:
@@ -48,19 +50,15 @@ def _boundary(cells: np.ndarray) -> np.ndarray:
     for change in (-1, 0, 1):  # right, straight on, left: the last one found is taken
         nxt = number[(turns + change) % 4, ends[:, 0], ends[:, 1]]
         follower = np.where(nxt >= 0, nxt, follower)
-    largest, area = np.zeros(0, int), 0.0
-    following, seen = follower.tolist(), [False] * len(turns)
-    for first in range(len(turns)):
-        loop, edge = [], first
-        while not seen[edge]:
-            seen[edge] = True
-            loop.append(edge)
-            edge = following[edge]
-        inside = float(np.sum(columns[loop] * -moves[turns[loop], 0]))  # negative of a hole
-        if inside > area:
-            largest, area = np.array(loop), inside
-    is_corner = turns[largest] != np.roll(turns[largest], 1)
-    return np.stack([rows, columns], axis=1)[largest[is_corner]].astype(float)
+    first = np.unravel_index(int(cells.argmax()), cells.shape)  # has no neighbour in the row before
+    start = int(number[3, first[0], first[1] + 1])
+    following = follower.tolist()
+    loop, edge = [start], following[start]
+    while edge != start:
+        loop.append(edge)
+        edge = following[edge]
+    is_corner = turns[loop] != np.roll(turns[loop], 1)
+    return np.stack([rows, columns], axis=1)[loop][is_corner].astype(float)
 
 
 def _simplified(polygon: np.ndarray) -> np.ndarray:

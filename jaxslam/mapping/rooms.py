@@ -19,7 +19,7 @@ from jaxslam.core.types import as_float64, check_array
 from jaxslam.mapping import medial_axis, region_names
 from jaxslam.mapping.doors import find_doors
 from jaxslam.mapping.gaps import Gaps, take
-from jaxslam.mapping.region_merging import divide
+from jaxslam.mapping.region_merging import divide, largest
 from jaxslam.mapping.region_outline import outlines
 
 FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
@@ -91,9 +91,9 @@ def find_regions(
     label, cells, sides = number[label], number[cells], number[sides]
     corner = np.array([side.start for side in box])
     gaps = gaps._replace(feet=gaps.feet - 1 + corner, middle=gaps.middle - 1.0 + corner)
-    radius = ndimage.maximum(distance, cells, np.arange(1, cells.max(initial=0) + 1))
+    radius = largest(distance, cells, int(number.max()))[1:] * resolution
     area = np.bincount(label[free], minlength=len(radius) + 1)[1:] * resolution**2
-    regions = _regions(label, area, np.asarray(radius) * resolution, resolution, origin)
+    regions = _regions(label, area, radius, resolution, origin)
     found = Regions(label, regions, (), resolution, origin)
     return region_names.named(_with_doors(found, gaps, sides), previous)
 

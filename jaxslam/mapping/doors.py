@@ -163,4 +163,5 @@ class _Search:
         if 2.0 * distance[tuple(cells.T)].max(initial=0.0) < HALL_RATIO * width:
             return None
         beside = self._passages.beside(k, 0.5 * width)
+        beside = beside[gaps.width[beside] <= width + 1.0]  # others are askew
         return int(beside[((gaps.middle[beside] - middle) @ normal).argmax()])

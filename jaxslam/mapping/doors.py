@@ -22,7 +22,8 @@ HALL_RATIO = 2.5  # width of a hall, at least, relative to a corridor that ends 
 HALL_RANGE = 2.5  # widths of the corridor within which the hall is so wide
 _HALL_RAYS = np.radians(np.arange(-75.0, 76.0, 15.0))
 _STEP = 0.7  # [cells] along lines
-_BATCH = 64  # gaps that are looked at together
+_BATCH = 64  # gaps that are looked at together, at most
+_POINTS = 2e6  # that are looked up for them
 
 
 def find_doors(
@@ -113,14 +114,19 @@ class _Search:
         gap is at least `WIDENING` times as long.
 
         Args:
-            chosen: (n,) indices of gaps.
+            chosen: (n,) indices of gaps, narrow ones first.
 
         Returns:
             (n, 2) bool, in front of the normals and behind them.
         """
         found = [np.zeros((0, 2), bool)]
-        for first in range(0, len(chosen), _BATCH):
-            found.append(self._widens(chosen[first : first + _BATCH]))
+        points = 4.0 * len(self._ahead) * (WIDENING * self._gaps.width[chosen] / _STEP + 3.0)
+        first = 0
+        while first < len(chosen):
+            widest = points[min(first + _BATCH, len(chosen)) - 1]
+            last = first + int(np.clip(_POINTS / widest, 1, _BATCH))
+            found.append(self._widens(chosen[first:last]))
+            first = last
         return np.concatenate(found)
 
     def _widens(self, chosen: np.ndarray) -> np.ndarray:

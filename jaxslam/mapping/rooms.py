@@ -23,7 +23,7 @@ from jaxslam.mapping.region_merging import divide, largest
 from jaxslam.mapping.region_outline import outlines
 
 FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
-MIN_AREA = 1.5  # [m^2] of a region
+MIN_AREA = 1.0  # [m^2] of a region
 MIN_CLOSED_AREA = 5.0  # [m^2] of a region without a door
 CORRIDOR_LENGTH = 3.0  # length of a corridor, at least, relative to its largest width
 OUTSIDE_SHARE = 0.5  # of the border of a grid that lies outside, more than

@@ -15,7 +15,17 @@ from jaxslam.core.scan import Scan
 from jaxslam.evaluation.log_errors import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import g2o_writer, geojson, graphml, lif, map_file, rmf_graph, ros_map, tum
+from jaxslam.io import (
+    g2o_writer,
+    geojson,
+    graphml,
+    lif,
+    map_file,
+    rmf_graph,
+    rooms_file,
+    ros_map,
+    tum,
+)
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
 from jaxslam.io.output import write_json, write_text
@@ -262,12 +272,17 @@ def draw_localisation(path: Path, saved_map: SavedMap, infos: LocaliseInfo) -> N
     figure.savefig(path)
 
 
-def draw_map(path: Path, occupancy: OccupancyMap, graph: TopologicalMap) -> None:
-    """Draw an occupancy grid with its topological map."""
-    from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
+def draw_map(
+    path: Path, occupancy: OccupancyMap, graph: TopologicalMap, regions: Regions | None = None
+) -> None:
+    """Draw an occupancy grid with its topological map, its rooms and its doors."""
+    # Imported here, because matplotlib is slow to import.
+    from jaxslam.viz import canvas, maps, rooms
 
     figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
     maps.draw_occupancy(axis, occupancy)
+    if regions is not None:
+        rooms.draw_rooms(axis, regions, rooms_file.region_colours(regions))
     maps.draw_topological_map(axis, graph)
     canvas.legend(figure)
     figure.savefig(path)

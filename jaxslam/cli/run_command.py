@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import report, run_results, summaries
+from jaxslam.cli import report, room_results, run_results, summaries
 from jaxslam.cli.options import (
     FileOfEach,
     OptionalCount,
@@ -80,10 +80,11 @@ def run(
 
     Every scan is matched; filter and maps are given keyframes, 0.3 m or 0.3 rad apart. Writes
     metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson, with
-    the extra [graph] as map.graphml, and for fleets as map.lif.json and map.rmf.yaml; an occupancy
-    grid as map.yaml and map.pgm, for map_server and `jaxslam map`; the pose graph graph.g2o, for
-    batch optimisers; and map.npz, all that later sessions need of the map, for `jaxslam.load_map`.
-    The pose of the first scan is the origin of the map. Where the map contradicts itself, loops are
+    the extra [graph] as map.graphml, and for fleets as map.lif.json and map.rmf.yaml; its rooms and
+    doors as rooms.json and rooms.png; all drawn in map.png; an occupancy grid as map.yaml and
+    map.pgm, for map_server and `jaxslam map`; the pose graph graph.g2o, for batch optimisers; and
+    map.npz, all that later sessions need of the map, for `jaxslam.load_map`. The pose of the first
+    scan is the origin of the map. Where the map contradicts itself, loops are
     closed at places that are found again, however far off, and a note names them. A WARNING names
     the scans where it still does, because the run was lost there; path.png marks them.
 
@@ -156,6 +157,7 @@ def run(
     mapping = MappingSpec(topology, robot_radius)
     given = given._replace(config=given.config._replace(mapping=mapping))
     config, scans = given.config, given.scans
+    rooms, room_notes = (None, ()) if saved_map is None else room_results.earlier_rooms(saved_map)
     if scan is not None:
         check_range("--scan", scan, 0, len(given.increments) - 1)
     with folder(out) as out_dir:
@@ -179,11 +181,12 @@ def run(
             gif=gif,
             saved_map=earlier,
             annotated_map=annotated,
+            earlier_rooms=rooms,
         )
         folders = [f"part_{k + 2}" for k in range(len(result.other_parts))]
         extra: Metrics = {
             "skipped_lines": sum(drive.log.num_skipped for drive in drives),
-            "mended": [*given.notes, *reference_notes, *result.notes],
+            "mended": [*given.notes, *reference_notes, *room_notes, *result.notes],
             "odometry": given.odometry_source,
             "seconds": seconds,
         }

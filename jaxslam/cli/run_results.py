@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli import report
+from jaxslam.cli import report, room_results
 from jaxslam.cli.run_evaluation import (
     RecordedDrive,
     breaks_of,
@@ -16,6 +16,7 @@ from jaxslam.cli.run_evaluation import (
     not_used,
 )
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.regions import Regions
 from jaxslam.core.se2_np import compose, relative, trajectories_as_one
 from jaxslam.core.time_series import match_times
 from jaxslam.evaluation import log_errors
@@ -24,6 +25,7 @@ from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import tum
 from jaxslam.io.annotated_map import AnnotatedMap
+from jaxslam.mapping.planner_data import planner_data
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.log_input import LogInput
 from jaxslam.pipeline.results import SlamResult
@@ -41,6 +43,7 @@ class RunContext(NamedTuple):
         gif: Whether an animation is written.
         saved_map: The map that the run goes on in, if any.
         annotated_map: Its map.geojson, with what a user added.
+        earlier_rooms: Its rooms and doors, whose names are kept.
     """
 
     drives: tuple[RecordedDrive, ...]
@@ -51,6 +54,7 @@ class RunContext(NamedTuple):
     gif: bool
     saved_map: SavedMap | None = None
     annotated_map: AnnotatedMap | None = None
+    earlier_rooms: Regions | None = None
 
 
 def write(
@@ -124,7 +128,15 @@ def write(
     if result.saved_poses is None:  # a map of its own
         saved, old = None, None
     next_id = max(int(result.belief.next_id), result.next_id)
-    report.write_results(out_dir, numbers, result.topological_map, old, next_id)
+    graph, occupancy = result.topological_map, result.occupancy
+    assert occupancy is not None  # of `run_slam`
+    earlier = None if saved is None else context.earlier_rooms
+    radius = config.mapping.robot_radius
+    rooms = room_results.write_rooms_of(out_dir, occupancy, earlier, robot_radius=radius)
+    planner = planner_data(graph, occupancy, rooms)
+    numbers |= {"rooms": len(rooms.regions), "doors": len(rooms.doors)}
+    report.write_results(out_dir, numbers, graph, old, next_id, rooms, planner)
+    report.draw_map(out_dir / "map.png", occupancy, graph, rooms)
     measurements = Measurement(
         jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
     )
@@ -134,7 +146,16 @@ def write(
     of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
     times = np.concatenate([drive.log.times for drive in context.drives])[result.keyframes]
     report.write_maps(
-        out_dir, config, context.params, result, measurements, times, of_keyframes, saved
+        out_dir,
+        config,
+        context.params,
+        result,
+        measurements,
+        times,
+        of_keyframes,
+        saved,
+        rooms,
+        planner,
     )
     bounds = [(warning.first_scan, warning.last_scan) for warning in consistency.warnings]
     report.draw(

@@ -105,10 +105,11 @@ def print_map_summary(numbers: Metrics, title: str, out: Path) -> None:
     print(f"  {'total arc length [m]':34}{numbers['length_m']:10.1f}")
     if numbers["arcs"]:
         print(f"  {'smallest clearance [m]':34}{numbers['narrowest_m']:10.2f}")
+    print(f"  {'rooms, doors':34}{numbers['rooms']:10d}{numbers['doors']:10d}")
     areas = f"{numbers['reached_m2']:10.1f}{numbers['left_out_m2']:10.1f}"
     print(f"  {'reachable, omitted area [m^2]':34}{areas}")
     print(f"  {'run time [s]':34}{numbers['seconds']['run']:10.1f}")
-    print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, map.graphml")
+    print(f"results: {out}{os.sep}metrics.json, map.png, map.geojson, rooms.json, ...")
 
 
 def print_route_summary(numbers: Metrics, title: str, legs: Sequence[str], out: Path) -> None:

@@ -54,6 +54,8 @@ class Regions(NamedTuple):
         doors: D doors.
         resolution: [m] side of a cell.
         origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
+        last_numbers: Highest numbers that names of regions and of doors ever had, also of those
+            that are no more.
     """
 
     label: np.ndarray
@@ -61,6 +63,7 @@ class Regions(NamedTuple):
     doors: tuple[Door, ...]
     resolution: float
     origin: np.ndarray
+    last_numbers: tuple[int, int] = (0, 0)
 
 
 class PlannerData(NamedTuple):

@@ -1,8 +1,6 @@
 """The map in an output folder of `jaxslam run` or `jaxslam map`, as a planner needs it."""
 
 from collections.abc import Iterator, Sequence
-from importlib import import_module
-from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +11,7 @@ from jaxslam.core import polylines
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.regions import Regions
 from jaxslam.core.types import CORNER, JUNCTION
-from jaxslam.io import annotated_map, ros_map
+from jaxslam.io import annotated_map, rooms_file, ros_map
 from jaxslam.io.annotated_map import (
     LINES,
     AnnotatedMap,
@@ -109,11 +107,8 @@ def read_map_folder(path: str | PathLike) -> MapFolder:
 
 def _regions(folder: Path) -> Regions | None:
     """Rooms and doors of a folder, if it has any."""
-    path, module = folder / ROOMS, "jaxslam.io.rooms_file"
-    if not path.is_file() or find_spec(module) is None:
-        return None
-    regions: Regions = import_module(module).read_rooms(path)
-    return regions
+    path = folder / rooms_file.JSON_NAME
+    return rooms_file.read_rooms(path) if path.is_file() else None
 
 
 def _graph(

@@ -23,6 +23,8 @@ FORMATS = ("PPM", "PNG", "BMP")  # PPM stands for all of PBM, PGM and PPM
 MODES = ("trinary", "scale", "raw")
 UNKNOWN_SHADE, FREE_SHADE = 205, 254  # [0, 255] that map_saver writes; 254 and 255 are free
 UNKNOWN_PROBABILITY = 1 - UNKNOWN_SHADE / 255
+THRESHOLDS = (0.196, 0.65)  # free below, occupied above; the shade 205 is just above the first
+PICTURES = tuple(".png .pgm .pbm .ppm .pnm .bmp .jpg .jpeg .gif .tif .tiff".split())
 FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 
@@ -73,8 +75,56 @@ def read(path: str | PathLike) -> OccupancyMap:
         problem = f"{free_below} is not below the occupied_thresh of {occupied_above}"
         raise InputError(problem, path=path, field="free_thresh")
     image, notes = _image_path(path, fields["image"])
+    return _to_map(
+        image, resolution, origin, notes, (mode, bool(negate), free_below, occupied_above)
+    )
+
+
+def read_picture(path: str | PathLike, resolution: float) -> OccupancyMap:
+    """Read a map from a picture alone: white is free, black occupied.
+
+    The thresholds are those that map_saver writes; the lower left corner is the origin.
+
+    Args:
+        path: PGM, PNG or BMP image.
+        resolution: [m] side of a cell.
+
+    Raises:
+        InputError: The picture cannot be read, or has no cells or more than `MAX_CELLS`; or the
+            resolution is not a positive number.
+    """
+    if not 0.0 < resolution < math.inf:
+        problem, advice = f"{resolution} is not positive", "give the side of a cell in metres"
+        raise InputError(problem, field="resolution", advice=advice)
+    return _to_map(Path(path), resolution, np.zeros(3), [], ("trinary", False, *THRESHOLDS))
+
+
+def files_of(path: str | PathLike) -> tuple[Path, ...]:
+    """The files of a map: the YAML file and its image, or a picture alone.
+
+    Raises:
+        InputError: The YAML file cannot be read, or names no image that it may name.
+    """
+    path = Path(path)
+    return (path,) if is_picture(path) else (path, _image_path(path, _load(path).get("image"))[0])
+
+
+def is_picture(path: str | PathLike) -> bool:
+    """Whether a path has the name of a picture, not of a YAML file."""
+    return Path(path).suffix.lower() in PICTURES
+
+
+def _to_map(
+    image: Path,
+    resolution: float,
+    origin: np.ndarray,
+    notes: list[str],
+    meaning: tuple[str, bool, float, float],
+) -> OccupancyMap:
+    """Map of an image; `meaning` is mode, negate, free_thresh and occupied_thresh."""
+    mode, negate, free_below, occupied_above = meaning
     shade, known = _read_image(image)
-    probability = _occupancy_probability(shade, mode, bool(negate))
+    probability = _occupancy_probability(shade, mode, negate)
     known &= np.isfinite(probability)
     if mode == "trinary" and not negate and UNKNOWN_PROBABILITY < free_below:
         is_unknown = _written_as_unknown(shade)
@@ -119,8 +169,8 @@ def write(path: str | PathLike, occupancy: OccupancyMap) -> None:
         "resolution": f"{resolution!r}",
         "origin": f"[{x!r}, {y!r}, {heading!r}]",
         "negate": "0",
-        "occupied_thresh": "0.65",
-        "free_thresh": "0.196",  # the shade 205 of unknown cells is just above
+        "occupied_thresh": f"{THRESHOLDS[1]}",
+        "free_thresh": f"{THRESHOLDS[0]}",
     }
     write_text(path, "".join(f"{name}: {value}\n" for name, value in fields.items()))
 
@@ -228,7 +278,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except InputError:
         raise
     except FileNotFoundError:
-        raise InputError("does not exist", path=path, advice="check the field image") from None
+        raise InputError("does not exist", path=path, advice="check its name") from None
     except Image.DecompressionBombError:
         raise InputError(f"has more than {MAX_CELLS} cells", path=path) from None
     except UnidentifiedImageError:

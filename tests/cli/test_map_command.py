@@ -9,10 +9,11 @@ from PIL import Image
 
 from jaxslam.cli import main, report
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
-from jaxslam.io import graphml
+from jaxslam.io import graphml, rooms_file, ros_map
 from jaxslam.viz import canvas, maps
 
 FILES = {"metrics.json", "map.geojson", "map.graphml", "map.lif.json", "map.rmf.yaml", "map.png"}
+FILES |= {"map.yaml", "map.pgm", "rooms.json", "rooms.png"}
 YAML = "image: a.pgm\nresolution: 0.1\norigin: [-2.0, 1.0, 0.0]\nnegate: 0\n"
 YAML += "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
 MAPS = Path(__file__).resolve().parents[3] / "shared" / "data" / "maps"
@@ -41,8 +42,8 @@ def test_map_writes_its_files_and_nothing_else(done):
     assert {file.name for file in out.iterdir()} == FILES
     assert {file.name for file in out.parent.iterdir()} == {"out", "a.pgm", "a.yaml"}
     assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
-    assert "dead ends" in said and str(out) in said and len(said.splitlines()) < 14
-    assert all("/4 [" in line for line in errors.split("\r") if line)  # a bar at most
+    assert "dead ends" in said and str(out) in said and len(said.splitlines()) < 15
+    assert all("/5 [" in line for line in errors.split("\r") if line)  # a bar at most
 
 
 def test_map_counts_what_it_found(done):
@@ -175,3 +176,85 @@ def test_recorded_maps_become_one_connected_graph(tmp_path, name, rings):
     numbers = json.loads((tmp_path / "metrics.json").read_text())
     assert networkx.is_connected(net) and numbers["rings"] > rings
     assert numbers["reached_m2"] > 50 * numbers["left_out_m2"]
+
+
+def write_rooms_plan(folder, name="plan.png"):
+    """Two rooms of 5 x 4 m with a door of 1 m, white on grey, 0.05 m a pixel."""
+    free = np.zeros((220, 90), bool)
+    free[5:105, 5:85] = free[110:210, 5:85] = free[105:110, 30:50] = True
+    shade = np.where(free, 255, 128).astype(np.uint8)
+    shade[4] = shade[:, 4] = 0
+    Image.fromarray(shade.T[::-1]).save(folder / name)
+    return folder / name
+
+
+def run_map(*arguments):
+    return main.main(["map", *map(str, arguments)])
+
+
+def test_rooms_of_a_map(tmp_path, capsys):
+    plan = write_rooms_plan(tmp_path)
+    out = tmp_path / "out"
+    assert run_map(plan, "--resolution", 0.05, "--out", out) == 0
+    said = capsys.readouterr().out
+    assert "rooms, doors" in said and "rooms.json" in said
+    numbers = json.loads((out / "metrics.json").read_text())
+    assert numbers["rooms"] == 2 and numbers["doors"] == 1
+    rooms = rooms_file.read_rooms(out)
+    assert [region.name for region in rooms.regions] == ["room_1", "room_2"]
+    assert rooms.doors[0].width == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_allclose(rooms.doors[0].xy, [107.5 * 0.05, 2.0], atol=0.1)
+    picture = np.asarray(Image.open(out / "rooms.png"))
+    assert picture.shape == (90, 220, 3)
+    written = ros_map.read(out / "map.yaml")
+    assert written.free.shape == (220, 90) and written.resolution == 0.05
+    np.testing.assert_array_equal(written.free, picture[::-1].any(axis=2).T)
+
+
+def test_rooms_keep_their_names_in_the_same_folder(tmp_path, capsys):
+    plan, out = write_rooms_plan(tmp_path), tmp_path / "out"
+    arguments = (plan, "--resolution", 0.05, "--out", out)
+    assert run_map(*arguments) == 0
+    text = (out / "rooms.json").read_text()
+    for old, new in (("room_1", "room_41"), ("door_1", "door_5")):
+        text = text.replace(f'"{old}"', f'"{new}"')
+    text = text.replace('"room": 2', '"room": 60').replace('"door": 1', '"door": 7')
+    (out / "rooms.json").write_text(text)
+    assert run_map(*arguments) == 0
+    rooms = rooms_file.read_rooms(out)
+    assert {region.name for region in rooms.regions} == {"room_41", "room_2"}
+    assert rooms.doors[0].name == "door_5" and rooms.last_numbers == (60, 7)
+    assert "note" not in capsys.readouterr().out
+    (out / "rooms.json").write_text("{}")
+    assert run_map(*arguments) == 0
+    assert "note: rooms and doors get new names: " in capsys.readouterr().out
+    assert rooms_file.read_rooms(out).last_numbers == (2, 1)
+
+
+def test_map_does_not_overwrite_its_input(tmp_path, capsys):
+    plan, out = write_rooms_plan(tmp_path), tmp_path / "out"
+    assert run_map(plan, "--resolution", 0.05, "--out", out) == 0
+    before = {name: (out / name).read_bytes() for name in ("map.yaml", "map.pgm", "rooms.json")}
+    (out / "map.yaml").write_bytes(before["map.yaml"] + b"# mine\n")
+    assert run_map(out / "map.yaml", "--out", out) == 0
+    assert "map.yaml and map.pgm are not written" in capsys.readouterr().out
+    assert (out / "map.yaml").read_bytes().endswith(b"# mine\n")
+    for name in ("map.pgm", "rooms.json"):
+        assert (out / name).read_bytes() == before[name]
+    assert run_map(out / "map.pgm", "--resolution", 0.05, "--out", out) == 0
+    assert "not written" in capsys.readouterr().out
+    assert run_map(write_map(tmp_path), "--out", tmp_path) == 0
+    assert "not written" not in capsys.readouterr().out
+    assert (tmp_path / "map.yaml").is_file()
+
+
+def test_map_refuses_a_resolution_that_does_not_fit(refused, tmp_path):
+    plan = write_rooms_plan(tmp_path)
+    assert "plan.png: is a picture, which has no resolution; add --resolution" in refused(plan)
+    for value in (0, -0.05, "nan", "inf"):
+        assert "--resolution: " in refused(plan, "--resolution", value)
+    line = refused(write_map(tmp_path), "--resolution", 0.05)
+    assert "--resolution: is for a picture alone" in line and "a.yaml" in line
+    assert "none.png: does not exist" in refused(tmp_path / "none.png", "--resolution", 0.05)
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    assert "bad.png: is no image" in refused(tmp_path / "bad.png", "--resolution", 0.05)

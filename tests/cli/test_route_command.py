@@ -171,7 +171,10 @@ def test_bad_folders_and_radii_are_one_line(refused, tmp_path, floor):
     assert "none: does not exist; name an output folder" in refused(tmp_path / "none", *ends)
     assert refused(tmp_path, *ends).startswith(f"{tmp_path}: holds no map.geojson; name")
     assert refused(floor, *ends, "--robot-radius", "nan").startswith("--robot-radius: nan is not")
-    assert refused(floor, "--from", -3, -1, "--to", "room_1").startswith("--to: 'room_1', and the")
+    shutil.copytree(floor, tmp_path / "bare")
+    (tmp_path / "bare" / "rooms.json").unlink()
+    line = refused(tmp_path / "bare", "--from", -3, -1, "--to", "room_1")
+    assert line.startswith("--to: 'room_1', and the")
 
 
 def test_an_interrupt_leaves_nothing_behind(floor, tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ def test_help_says_in_a_line_what_each_command_does(capsys):
     text = printed_help(capsys)
     assert "simulate Run SLAM on Monte-Carlo trials" in text
     assert "run Run SLAM on a laser log." in text
-    assert "map Extract the topological map of a ROS occupancy grid." in text
+    assert "map Extract the topological map, the rooms and the doors of an occupancy grid." in text
     assert "tune Tune the noise parameters of the filter (Q and R)" in text
     assert "Writes" not in text
 

@@ -1,0 +1,92 @@
+"""Outer boundaries of labelled cells, as polygons."""
+
+import numpy as np
+from scipy import ndimage
+
+TOLERANCE = 1.0  # [cells] of a polygon
+
+
+def outlines(label: np.ndarray, count: int) -> list[np.ndarray]:
+    """Outer boundary (n, 2) [cells] of each of the labels 1 to `count`, counter-clockwise.
+
+    The largest part of a label is outlined if it has several; its holes are not. Cell [i, j] is the
+    square from (i, j) to (i + 1, j + 1).
+
+    Args:
+        label: (H, W) int.
+        count: Number of labels; each has a cell.
+    """
+    found = []
+    for k, box in enumerate(ndimage.find_objects(label, count), start=1):
+        corner = np.array([side.start for side in box])
+        cells, parts = ndimage.label(np.pad(label[box] == k, 1))
+        largest = np.bincount(cells.ravel())[1:].argmax() + 1 if parts > 1 else 1
+        found.append(_simplified(_boundary(cells == largest)) + corner - 1.0)
+    return found
+
+
+def _boundary(cells: np.ndarray) -> np.ndarray:
+    """Corners (n, 2) of the outer boundary of connected cells (H, W) bool; the border is not set.
+
+    Each side of a cell whose neighbour is not set is an edge with the cell on its left. Where two
+    cells meet in a corner alone, the boundary stays with its cell:
+
+        # .         a turn to the left wherever there is a choice
+        . #
+    """
+    height, width = cells.shape
+    moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # each turned left from the one before
+    beside = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]])  # neighbour on the right of each edge
+    starts = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # corner of the cell where it begins
+    edge_at = np.zeros((4, height + 1, width + 1), bool)
+    for turn in range(4):
+        row, column = np.nonzero(cells & ~np.roll(cells, -beside[turn], axis=(0, 1)))
+        edge_at[turn, row + starts[turn, 0], column + starts[turn, 1]] = True
+    turns, rows, columns = np.nonzero(edge_at)
+    number = np.full(edge_at.shape, -1)
+    number[turns, rows, columns] = np.arange(len(turns))
+    ends = np.stack([rows, columns], axis=1) + moves[turns]
+    follower = np.full(len(turns), -1)
+    for change in (-1, 0, 1):  # right, straight on, left: the last one found is taken
+        nxt = number[(turns + change) % 4, ends[:, 0], ends[:, 1]]
+        follower = np.where(nxt >= 0, nxt, follower)
+    first = np.unravel_index(int(cells.argmax()), cells.shape)  # has no neighbour in the row before
+    start = int(number[3, first[0], first[1] + 1])
+    following = follower.tolist()
+    loop, edge = [start], following[start]
+    while edge != start:
+        loop.append(edge)
+        edge = following[edge]
+    is_corner = turns[loop] != np.roll(turns[loop], 1)
+    return np.stack([rows, columns], axis=1)[loop][is_corner].astype(float)
+
+
+def _simplified(polygon: np.ndarray) -> np.ndarray:
+    """Polygon of fewer corners, at most `TOLERANCE` from the given one (n, 2).
+
+    References:
+        Douglas, Peucker (1973), Algorithms for the reduction of the number of points required to
+        represent a digitized line or its caricature.
+    """
+    first = int(np.lexsort(polygon.T[::-1])[0])
+    loop = np.roll(polygon, -first, axis=0)
+    loop = np.concatenate([loop, loop[:1]])
+    middle = int(np.hypot(*(loop - loop[0]).T).argmax())
+    kept, pieces = {0, middle}, [(0, middle), (middle, len(loop) - 1)]
+    while pieces:
+        start, stop = pieces.pop()
+        if stop - start < 2:
+            continue
+        away = _distances(loop[start + 1 : stop], loop[start], loop[stop])
+        if away.max() > TOLERANCE:
+            furthest = start + 1 + int(away.argmax())
+            kept.add(furthest)
+            pieces += [(start, furthest), (furthest, stop)]
+    return loop[sorted(kept)]
+
+
+def _distances(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distances (n,) of points (n, 2) from the segment between two points (2,)."""
+    step, offset = end - start, points - start
+    share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+    return np.hypot(offset[:, 0] - share * step[0], offset[:, 1] - share * step[1])

@@ -1,0 +1,186 @@
+"""Rooms, corridors and halls of an occupancy map, and the doors between them.
+
+The steps of `find_regions`:
+
+    free space, small free-standing obstacles (furniture) filled
+    -> gaps between walls that face each other (`gaps`), the doors among them (`doors`)
+    -> parts between doors, small ones merged (`region_merging`) -> outlines (`region_outline`)
+    -> names, those of an earlier division where they fit (`region_names`)
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from jaxslam.core.regions import Door, Region, Regions
+from jaxslam.core.se2_np import transform
+from jaxslam.core.types import as_float64, check_array
+from jaxslam.mapping import medial_axis, region_names
+from jaxslam.mapping.doors import find_doors
+from jaxslam.mapping.gaps import Gaps, take
+from jaxslam.mapping.region_merging import divide, largest
+from jaxslam.mapping.region_outline import outlines
+
+FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
+MIN_AREA = 1.0  # [m^2] of a region
+MIN_CLOSED_AREA = 5.0  # [m^2] of a region without a door
+CORRIDOR_LENGTH = 3.0  # length of a corridor, at least, relative to its largest width
+OUTSIDE_SHARE = 0.5  # of the border of a grid that lies outside, more than
+HALL_AREA = 50.0  # [m^2] of a hall, at least
+
+
+def find_regions(
+    occupied: ArrayLike,
+    free: ArrayLike,
+    *,
+    resolution: float,
+    origin: ArrayLike,
+    robot_radius: float = 0.25,
+    previous: Regions | None = None,
+) -> Regions:
+    """Divide the free space of an occupancy map into regions at its doors.
+
+    A region is free space in which the robot fits, at least `MIN_AREA` large (`MIN_CLOSED_AREA`
+    without a door), whether or not the robot fits through its doors. Small free-standing obstacles
+    belong to the region around them, but not to its area. Free space along most of the border of
+    the grid is outside, no region.
+
+    Args:
+        occupied: (H, W) bool; i grows with x, j with y.
+        free: (H, W) bool; a cell that is neither is unknown, and bounds regions like a wall.
+        resolution: [m] side of a cell.
+        origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
+        robot_radius: [m] of the robot.
+        previous: Regions of the same place, found earlier, whose names are kept; of these, only
+            names, polygons, doors and `last_numbers` matter.
+
+    Raises:
+        ValueError: An argument has another type, shape or range.
+
+    References:
+        Bormann, Jordan, Li, Hampp, Haegele (2016), on room segmentation, ICRA: the problem and its
+        benchmark. Mielle, Magnusson, Lilienthal (2018), A method to segment maps from different
+        modalities using free space layout.
+    """
+    occupied, free = np.asarray(occupied), np.asarray(free)
+    check_array("occupied", occupied, ("H", "W"), jnp.bool_)
+    check_array("free", free, occupied.shape, jnp.bool_)
+    origin = as_float64("origin", origin, (3,))
+    for name, size in (("resolution", resolution), ("robot_radius", robot_radius)):
+        if not 0.0 < size < np.inf:
+            raise ValueError(f"{name} is {size}, not a positive number of metres")
+    label = np.zeros(free.shape, np.int32)
+    free = np.asarray(free & ~occupied)
+    if not free.any():
+        return region_names.named(Regions(label, (), (), resolution, origin), previous)
+    (box,) = ndimage.find_objects(free.astype(np.int8))
+    space, distance, nearest = _space(occupied[box], free[box], resolution)
+    gaps = find_doors(space, distance, nearest, resolution=resolution)
+    cells, sides = divide(
+        space,
+        distance,
+        gaps,
+        min_area=MIN_AREA / resolution**2,
+        min_radius=robot_radius / resolution,
+    )
+    kept = _has_door(cells, sides, MIN_CLOSED_AREA / resolution**2)
+    label[box] = cells[1:-1, 1:-1]
+    kept &= ~_is_outside(label, len(kept))
+    number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
+    label, cells, sides = number[label], number[cells], number[sides]
+    corner = np.array([side.start for side in box])
+    gaps = gaps._replace(feet=gaps.feet - 1 + corner, middle=gaps.middle - 1.0 + corner)
+    radius = largest(distance, cells, int(number.max()))[1:] * resolution
+    area = np.bincount(label[free], minlength=len(radius) + 1)[1:] * resolution**2
+    regions = _regions(label, area, radius, resolution, origin)
+    found = Regions(label, regions, (), resolution, origin)
+    return region_names.named(_with_doors(found, gaps, sides), previous)
+
+
+def _space(
+    occupied: np.ndarray, free: np.ndarray, resolution: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Free space without furniture, with a border that is not free.
+
+    Returns:
+        Free cells (H + 2, W + 2) bool, their distance [cells] to the nearest obstacle and its
+        indices (2, H + 2, W + 2).
+    """
+    size = FURNITURE_SIZE / resolution
+    space = medial_axis.free_space(occupied, free, min_obstacle_size=size, min_unknown_size=size)
+    space = np.pad(space, 1)
+    distance, nearest = ndimage.distance_transform_edt(space, return_indices=True)
+    return space, distance - 0.5, nearest
+
+
+def _has_door(label: np.ndarray, sides: np.ndarray, min_area: float) -> np.ndarray:
+    """Which labels (L + 1,) have a door, `min_area` cells without one, or are the largest; not 0.
+
+    Smaller ones are the insides of furniture, or what was seen through glass.
+
+    Args:
+        label: (H, W) int.
+        sides: (K, 2) labels on the two sides of each gap.
+        min_area: [cells]
+    """
+    area = np.bincount(label.ravel())
+    area[0] = 0
+    kept = (area >= min_area) | (area == area.max())
+    kept[sides[(sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])].ravel()] = True
+    kept[0] = False
+    return kept
+
+
+def _is_outside(label: np.ndarray, count: int) -> np.ndarray:
+    """Which labels (count,) lie along most of the border of the grid; not 0."""
+    border = np.concatenate([label[0], label[-1], label[1:-1, 0], label[1:-1, -1]])
+    outside = np.bincount(border, minlength=count) > OUTSIDE_SHARE * len(border)
+    outside[0] = False
+    return outside
+
+
+def _to_map(points: np.ndarray, resolution: float, origin: np.ndarray) -> np.ndarray:
+    """Points (..., 2) [cells, from the corner of the grid] in the map frame [m]."""
+    return transform(origin, points * resolution)
+
+
+def _regions(
+    label: np.ndarray,
+    area: np.ndarray,
+    radius: np.ndarray,
+    resolution: float,
+    origin: np.ndarray,
+) -> tuple[Region, ...]:
+    """Regions of the labels, without names and doors; `area` [m^2] and `radius` [m] of each."""
+    found = []
+    for k, polygon in enumerate(outlines(label, len(area))):
+        long = area[k] >= CORRIDOR_LENGTH * (2.0 * radius[k]) ** 2
+        kind = "corridor" if long else "hall" if area[k] >= HALL_AREA else "room"
+        found.append(Region("", kind, _to_map(polygon, resolution, origin), float(area[k]), (), ()))
+    return tuple(found)
+
+
+def _with_doors(found: Regions, gaps: Gaps, sides: np.ndarray) -> Regions:
+    """Regions with the gaps that join two of them as doors; `sides` (K, 2) are their labels."""
+    joins = (sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])
+    gaps, pairs = take(gaps, joins), np.sort(sides[joins] - 1, axis=1)
+    ends = gaps.feet + 0.5
+    ends = ends + 0.5 * gaps.along[:, None] * np.array([1.0, -1.0])[:, None]
+    jambs = _to_map(ends, found.resolution, found.origin)
+    doors = tuple(
+        Door("", jamb.mean(axis=0), jamb, float(width) * found.resolution, (int(a), int(b)))
+        for jamb, width, (a, b) in zip(jambs, gaps.width, pairs, strict=True)
+    )
+    regions = tuple(
+        region._replace(
+            doors=tuple(np.flatnonzero((pairs == k).any(axis=1)).tolist()),
+            neighbours=tuple(np.unique(pairs[(pairs == k).any(axis=1)]).tolist()),
+        )
+        for k, region in enumerate(found.regions)
+    )
+    regions = tuple(
+        region._replace(neighbours=tuple(n for n in region.neighbours if n != k))
+        for k, region in enumerate(regions)
+    )
+    return found._replace(regions=regions, doors=doors)

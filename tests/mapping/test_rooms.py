@@ -1,0 +1,317 @@
+import jax
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from jaxslam.core.regions import Regions
+from jaxslam.mapping import region_names, region_outline, rooms
+from jaxslam.mapping.gaps import gaps_between, line_cells
+from jaxslam.mapping.rooms import find_regions
+
+CELL = 0.05
+ORIGIN = np.array([-3.0, 2.0, 0.4])
+DOOR = (np.array([4.2, 2.0]), 0.9)  # [m] middle and width
+
+
+def carved(*boxes, shape=(180, 100)):
+    """Free cells of boxes x0, x1, y0, y1 [m]."""
+    free = np.zeros(shape, bool)
+    for x0, x1, y0, y1 in np.rint(np.array(boxes) / CELL).astype(int):
+        free[x0:x1, y0:y1] = True
+    return free
+
+
+def two_rooms():
+    """Rooms of 3.8 x 4 m and 4 x 4 m with a wall of 0.2 m and a door of 0.9 m between them."""
+    return carved((0.3, 4.1, 0.3, 4.3), (4.3, 8.3, 0.3, 4.3), (4.1, 4.3, 1.55, 2.45))
+
+
+def divided(free, occupied=None, **options):
+    occupied = ~free if occupied is None else occupied
+    options = {"resolution": CELL, "origin": np.zeros(3)} | options
+    return find_regions(occupied, free, **options)
+
+
+def turned(free, degrees):
+    return ndimage.rotate(free.astype(np.uint8), degrees, order=0) > 0
+
+
+def contains(polygon, points):
+    """Whether points (n, 2) are inside a polygon (m, 2), by crossings."""
+    inside = np.zeros(len(points), bool)
+    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        crossed = (x0 <= points[:, 0]) != (x1 <= points[:, 0])
+        at = y0 + (points[:, 0] - x0) / np.where(x1 == x0, 1.0, x1 - x0) * (y1 - y0)
+        inside ^= crossed & (points[:, 1] < at)
+    return inside
+
+
+def check_records(found, free):
+    """Laws of every division."""
+    labels = np.unique(found.label)
+    assert found.label.shape == free.shape and found.label.dtype == np.int32
+    np.testing.assert_array_equal(labels[labels > 0], np.arange(len(found.regions)) + 1)
+    for k, region in enumerate(found.regions):
+        cells = (found.label == k + 1) & free
+        assert region.area == pytest.approx(cells.sum() * found.resolution**2)
+        assert all(k in found.regions[n].neighbours for n in region.neighbours)
+        assert region.doors == tuple(i for i, d in enumerate(found.doors) if k in d.regions)
+        behind = {r for i in region.doors for r in found.doors[i].regions} - {k}
+        assert set(region.neighbours) == behind
+        x, y = region.polygon.T
+        assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0.0
+    for door in found.doors:
+        assert door.regions[0] < door.regions[1]
+        assert door.width == pytest.approx(np.hypot(*(door.jambs[1] - door.jambs[0])))
+        np.testing.assert_allclose(door.jambs.mean(axis=0), door.xy)
+    names = [r.name for r in found.regions] + [d.name for d in found.doors]
+    assert len(set(names)) == len(names)
+
+
+def test_two_rooms_and_a_door():
+    free = two_rooms()
+    found = divided(free)
+    check_records(found, free)
+    assert [r.name for r in found.regions] == ["room_1", "room_2"]
+    assert [r.kind for r in found.regions] == ["room", "room"]
+    (door,) = found.doors
+    assert door.name == "door_1" and door.regions == (0, 1)
+    assert door.width == pytest.approx(DOOR[1], abs=CELL)
+    np.testing.assert_allclose(door.xy, DOOR[0], atol=2 * CELL)
+    np.testing.assert_allclose(np.sort(door.jambs[:, 1]), [1.55, 2.45], atol=CELL)
+    assert found.regions[0].area == pytest.approx(16.0, abs=0.2)  # the larger one
+    assert found.last_numbers == (2, 1)
+
+
+@pytest.mark.parametrize("degrees", [30, 45, 77])
+def test_a_turned_map_has_the_same_rooms(degrees):
+    free = turned(two_rooms(), degrees)
+    found = divided(free)
+    check_records(found, free)
+    (door,) = found.doors
+    assert len(found.regions) == 2 and door.width == pytest.approx(DOOR[1], abs=2 * CELL)
+    areas = sorted(region.area for region in found.regions)
+    np.testing.assert_allclose(areas, [15.2, 16.0], atol=0.4)
+
+
+def test_positions_are_in_the_frame_of_the_map():
+    found, moved = divided(two_rooms()), divided(two_rooms(), origin=ORIGIN)
+    c, s = np.cos(ORIGIN[2]), np.sin(ORIGIN[2])
+    for here, there in zip(found.regions, moved.regions, strict=True):
+        expected = here.polygon @ np.array([[c, s], [-s, c]]) + ORIGIN[:2]
+        np.testing.assert_allclose(there.polygon, expected, atol=1e-9)
+    expected = found.doors[0].jambs @ np.array([[c, s], [-s, c]]) + ORIGIN[:2]
+    np.testing.assert_allclose(moved.doors[0].jambs, expected, atol=1e-9)
+
+
+def test_translation_and_mirror_images_have_the_same_rooms():
+    free = corridor_with_rooms()
+    found = divided(free)
+    moved = divided(np.pad(free, ((13, 4), (9, 2))))
+    np.testing.assert_array_equal(moved.label[13:-4, 9:-2], found.label)
+    for flip in (np.s_[::-1], np.s_[:, ::-1]):
+        mirrored = divided(free[flip])
+        assert len(mirrored.regions) == len(found.regions)
+        assert len(mirrored.doors) == len(found.doors)
+        pairs = found.label[flip].astype(np.int64) * 100 + mirrored.label
+        counts = np.unique(pairs, return_counts=True)[1]
+        assert np.sort(counts)[-len(found.regions) - 1 :].sum() > 0.99 * free.size
+
+
+def corridor_with_rooms():
+    """A corridor of 12 x 1.6 m with two rooms on each side, and a hall at its end."""
+    return carved(
+        (0.3, 12.3, 3.6, 5.2),
+        *((x, x + 4.0, 0.3, 3.4) for x in (0.3, 4.6)),
+        *((x, x + 4.0, 5.4, 8.5) for x in (0.3, 4.6)),
+        *((x, x + 0.85, 3.3, 3.7) for x in (1.5, 5.5)),
+        *((x, x + 0.85, 5.1, 5.5) for x in (2.5, 6.5)),
+        (12.3, 20.3, 0.3, 8.5),
+        shape=(420, 180),
+    )
+
+
+def test_corridor_rooms_and_hall():
+    free = corridor_with_rooms()
+    found = divided(free)
+    check_records(found, free)
+    assert sorted(r.kind for r in found.regions) == ["corridor", "hall", *["room"] * 4]
+    assert len(found.doors) == 5
+    corridor = next(r for r in found.regions if r.kind == "corridor")
+    assert len(corridor.neighbours) == 5 and corridor.area == pytest.approx(19.2, abs=1.0)
+    widths = sorted(door.width for door in found.doors)
+    np.testing.assert_allclose(widths, [0.85] * 4 + [1.6], atol=CELL)
+
+
+def test_door_frames_and_bends_do_not_divide_a_corridor():
+    ring = carved((0.3, 8.3, 0.3, 8.3), shape=(180, 180)) & ~carved(
+        (1.9, 6.7, 1.9, 6.7), shape=(180, 180)
+    )
+    ring[80:84, 6:8] = ring[80:84, 36:38] = False  # a shallow frame, 1.4 m wide in 1.6 m
+    found = divided(ring)
+    assert [r.kind for r in found.regions] == ["corridor"] and not found.doors
+
+
+def test_furniture_divides_nothing():
+    free = two_rooms()
+    rng = np.random.default_rng(1)
+    furnished = free.copy()
+    for x, y in rng.uniform([0.5, 0.5], [8.1, 4.1], (60, 2)):
+        size = rng.uniform(0.05, 0.3)
+        leg = carved((x, x + size, y, y + size)) & ~ndimage.binary_dilation(~free, iterations=4)
+        furnished &= ~leg
+    assert furnished.sum() < free.sum() - 500
+    bare, found = divided(free), divided(furnished)
+    check_records(found, furnished)
+    np.testing.assert_array_equal(found.label, bare.label)
+    for one, other in zip(found.regions, bare.regions, strict=True):
+        np.testing.assert_array_equal(one.polygon, other.polygon)
+        assert one.area < other.area
+    assert found.doors[0].width == bare.doors[0].width
+
+
+def test_labels_are_all_of_the_free_space_of_the_robot():
+    free = corridor_with_rooms()
+    free[2:4, 2:170] = True  # a slit that the robot does not fit in
+    found = divided(free)
+    assert not found.label[2:4].any()
+    np.testing.assert_array_equal(found.label[5:] > 0, free[5:])
+    for k in range(len(found.regions)):
+        assert ndimage.label(found.label == k + 1)[1] == 1
+
+
+def test_polygons_follow_the_cells():
+    free = turned(corridor_with_rooms(), 17)
+    found = divided(free)
+    cells = np.argwhere(np.ones(free.shape, bool))[::7]
+    for k, region in enumerate(found.regions):
+        far = ndimage.distance_transform_edt(found.label == k + 1) > 2.0
+        far |= ndimage.distance_transform_edt(found.label != k + 1) > 2.0
+        inside = contains(region.polygon, (cells + 0.5) * CELL)
+        is_region = found.label[tuple(cells.T)] == k + 1
+        checked = far[tuple(cells.T)]
+        np.testing.assert_array_equal(inside[checked], is_region[checked])
+        assert len(region.polygon) < 80
+
+
+def test_what_surrounds_a_plan_is_no_region():
+    plan = np.pad(two_rooms(), 2)
+    occupied = ndimage.binary_dilation(plan, iterations=2) & ~plan
+    occupied[3:6, 40:60] = False  # the door of the house
+    picture = np.pad(~occupied, 20, constant_values=True)
+    found = divided(picture)
+    assert len(found.regions) == 2 and not found.label[:10].any()
+    assert len(found.doors) == 1
+
+
+@pytest.mark.parametrize("size", [(0, 0), (3, 7), (40, 40)])
+def test_maps_without_a_room(size):
+    for value in (True, False):
+        free = np.full(size, value)
+        found = divided(free)
+        assert isinstance(found, Regions) and not found.doors
+        assert len(found.regions) == 0 and not found.label.any()
+
+
+def test_names_stay_when_a_map_is_made_again():
+    free = corridor_with_rooms()
+    first = divided(free)
+    rng = np.random.default_rng(2)
+    edge = free & ndimage.binary_dilation(~free)
+    noisy = free & ~(edge & (rng.random(free.shape) < 0.2))
+    again = divided(noisy, previous=first)
+    assert [r.name for r in again.regions] == [r.name for r in first.regions]
+    assert [d.name for d in again.doors] == [d.name for d in first.doors]
+    for one, other in zip(first.regions, again.regions, strict=True):
+        np.testing.assert_allclose(one.polygon.mean(axis=0), other.polygon.mean(axis=0), atol=1.5)
+        assert one.kind == other.kind
+    fresh = divided(free)
+    assert fresh.regions[0].name == "room_1"
+    np.testing.assert_array_equal(fresh.label, first.label)
+
+
+def test_names_stay_when_a_map_grows_and_are_not_used_again():
+    free = corridor_with_rooms()
+    small = free.copy()
+    small[:, 108:] = False  # without the rooms on one side
+    first = divided(small)
+    grown = np.pad(free, ((30, 0), (10, 0)))
+    origin = np.array([-30 * CELL, -10 * CELL, 0.0])
+    second = divided(grown, previous=first, origin=origin)
+    assert len(second.regions) == len(first.regions) + 2
+    for old in first.regions:
+        (new,) = (r for r in second.regions if r.name == old.name)
+        np.testing.assert_allclose(new.polygon.min(axis=0), old.polygon.min(axis=0), atol=0.2)
+    assert second.last_numbers[0] == len(second.regions)
+    third = divided(small, previous=second)
+    assert [r.name for r in third.regions] == [r.name for r in first.regions]
+    assert third.last_numbers == second.last_numbers
+    fourth = divided(grown, previous=third, origin=origin)
+    names = {r.name for r in fourth.regions} - {r.name for r in first.regions}
+    assert not names & {r.name for r in second.regions}
+
+
+def test_a_room_in_the_ring_of_another_keeps_its_own_name():
+    free = np.pad(two_rooms(), 60)
+    ring = np.ones_like(free)
+    ring[30:-30, 30:-30] = False
+    ring[[0, 1, -2, -1]] = ring[:, [0, 1, -2, -1]] = False
+    first = divided(free | ring)
+    assert len(first.regions) == 3
+    again = divided(free | ring, previous=first._replace(label=np.zeros((0, 0), np.int32)))
+    np.testing.assert_array_equal(again.label, first.label)
+
+
+def test_number_of_a_name():
+    names = ("room_12", "door_3", "room_0", "room_-1", "kitchen", "room_1x")
+    assert [region_names.number_of(name) for name in names] == [12, 3, 0, 0, 0, 0]
+
+
+def test_outlines_do_not_join_cells_across_corners():
+    label = np.zeros((6, 8), np.int32)
+    label[1:3, 1:4] = label[3:5, 4:6] = 1  # two parts that touch in a corner
+    (polygon,) = region_outline.outlines(label, 1)
+    np.testing.assert_array_equal(polygon, [[1, 1], [3, 1], [3, 4], [1, 4]])
+
+
+def test_lines_between_cells_are_connected():
+    cells = line_cells(np.array([[2, 3], [9, 7]]))
+    np.testing.assert_array_equal(cells[[0, -1]], [[2, 3], [9, 7]])
+    assert np.abs(np.diff(cells, axis=0)).max() == 1
+    gaps = gaps_between(np.array([[[2, 3], [2, 9]]]))
+    np.testing.assert_allclose([*gaps.normal[0], gaps.width[0]], [-1.0, 0.0, 5.0])
+
+
+@pytest.mark.parametrize(
+    "wrong, problem",
+    [
+        ({"resolution": 0.0}, "resolution"),
+        ({"robot_radius": np.nan}, "robot_radius"),
+        ({"origin": np.zeros(2)}, "origin"),
+        ({"occupied": np.zeros((3, 3), bool)}, "free"),
+        ({"free": np.zeros((180, 100))}, "free"),
+    ],
+)
+def test_arguments_that_do_not_fit(wrong, problem):
+    free = two_rooms()
+    given = {"occupied": ~free, "free": free, "resolution": CELL, "origin": np.zeros(3)}
+    with pytest.raises(ValueError, match=problem):
+        find_regions(**{**given, **wrong})
+
+
+def test_lists_and_jax_arrays_are_taken_alike():
+    free = two_rooms()
+    want = divided(free)
+    found = find_regions(
+        (~free).tolist(), jax.numpy.asarray(free), resolution=CELL, origin=[0, 0, 0]
+    )
+    np.testing.assert_array_equal(found.label, want.label)
+
+
+def test_parts_too_small_for_a_region_join_a_neighbour():
+    free = two_rooms()
+    free |= carved((8.3, 8.4, 1.0, 1.6), (8.4, 8.95, 0.9, 1.7))  # a niche behind a gap
+    found = divided(free)
+    assert len(found.regions) == 2 and len(found.doors) == 1
+    assert found.label[172, 26] == found.label[150, 40]
+    assert rooms.MIN_AREA > 0.5

@@ -29,7 +29,7 @@ GRAPH_TYPES = ("Point", *LINES)
 NODE_KEYS = ("id", "frame")
 EDGE_KEYS = ("id", "startid", "endid", "cost", "overridable")
 NODE_METADATA = ("kind", "clearance")
-EDGE_METADATA = ("arc", "length", "clearance")
+EDGE_METADATA = ("arc", "length", "clearance", "filled")
 _AGAIN = "correct it, or remove the file to start without annotations"
 
 

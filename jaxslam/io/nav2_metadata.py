@@ -4,7 +4,7 @@
     metadata.class        room, corridor, hall, or door                   nodes, edges
     metadata.door         names of the doors on an edge, with commas      edges
     metadata.speed_limit  [%] of the full speed, by clearance             edges
-    operations            one of type `OpenDoor` for each door            edges
+    operations            `OpenDoor` for each door up to 1.5 m wide       edges
 
 These keys a user may set too: a value that is not as it is written here is the user's, and stays.
 Of nav2_route, `AdjustSpeedLimit` takes `speed_limit` as a percentage and `DistanceScorer` divides
@@ -47,8 +47,8 @@ def speed_limit(clearance: float) -> float:
 
 
 def door_operations(label: Label) -> dict[str, Any]:
-    """Operations of an edge: its doors are opened when the robot enters it."""
-    return {f"open_{name}": _open(name) for name in label.doors}
+    """Operations of an edge: doors that may have a leaf are opened when the robot enters it."""
+    return {f"open_{name}": _open(name) for name in label.leaves}
 
 
 def users_metadata(metadata: Mapping[str, Any], clearance: float) -> dict[str, Any]:

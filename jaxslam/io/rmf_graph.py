@@ -13,6 +13,7 @@ from os import PathLike
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.io.output import write_text
+from jaxslam.io.route_labels import has_leaf
 from jaxslam.io.straight_lanes import Lane, straight_lanes
 
 
@@ -42,7 +43,7 @@ def write(
         InputError: The file cannot be written.
     """
     found = straight_lanes(graph, regions, planner)
-    doors = () if regions is None else regions.doors
+    doors = () if regions is None else tuple(d for d in regions.doors if has_leaf(d))
     text = [f"building_name: {_quoted(building)}"]
     text.append("doors:" if doors else "doors: {}")
     for door in doors:

@@ -3,10 +3,10 @@
     {"format": "jaxslam-rooms", "version": 1, "frame": "map", "units": "m, m^2",
      "last_numbers": {"room": N, "door": N},    highest that were ever in a name
      "resolution": [m], "origin": [x, y, yaw],  of the cells of the map [m, m, rad]
-     "regions": [{"name": "room_1", "kind": "room", "polygon": [[x, y], ...], "area": [m^2],
-                  "doors": [names], "neighbours": [names], "colour": [r, g, b] in rooms.png}],
+     "rooms": [{"name": "room_1", "kind": "room", "polygon": [[x, y], ...], "area": [m^2],
+               "doors": [names], "neighbours": [names], "colour": [r, g, b] in rooms.png}],
      "doors": [{"name": "door_1", "position": [x, y], "jambs": [[x, y], [x, y]], "width": [m],
-                "regions": [names of the two]}]}
+                "rooms": [names of the two]}]}
 
 `rooms.png` has a pixel for each cell, like the picture of the map: its top row has the largest y.
 Black is no region. Names and colours of regions stay from one session to the next.
@@ -52,7 +52,7 @@ def write_rooms(folder: str | PathLike, regions: Regions) -> None:
         "last_numbers": dict(zip(("room", "door"), regions.last_numbers, strict=True)),
         "resolution": regions.resolution,
         "origin": regions.origin,
-        "regions": [
+        "rooms": [
             {
                 "name": region.name,
                 "kind": region.kind,
@@ -70,7 +70,7 @@ def write_rooms(folder: str | PathLike, regions: Regions) -> None:
                 "position": np.round(door.xy, 4),
                 "jambs": np.round(door.jambs, 4),
                 "width": round(door.width, 4),
-                "regions": [names[k] for k in door.regions],
+                "rooms": [names[k] for k in door.regions],
             }
             for door in regions.doors
         ],
@@ -135,10 +135,10 @@ class _Reader:
         resolution = float(self._numbers(content, "resolution", (), ""))
         if resolution <= 0.0:
             self._refuse("is not positive", "resolution")
-        rows = [self._items(content, key) for key in ("regions", "doors")]
+        rows = [self._items(content, key) for key in ("rooms", "doors")]
         names, door_names = (
             self._names(items, key, last)
-            for items, key, last in zip(rows, ("regions", "doors"), numbers, strict=True)
+            for items, key, last in zip(rows, ("rooms", "doors"), numbers, strict=True)
         )
         doors = tuple(self._door(item, f"doors[{k}]", names) for k, item in enumerate(rows[1]))
         regions = tuple(
@@ -193,7 +193,7 @@ class _Reader:
 
     def _names(self, items: Sequence[dict[str, Any]], key: str, last: int) -> dict[str, int]:
         """Index of each item by its name."""
-        kind = "room" if key == "regions" else "door"
+        kind = "room" if key == "rooms" else "door"
         names: dict[str, int] = {}
         for k, item in enumerate(items):
             field = f"{key}[{k}].name"
@@ -217,7 +217,7 @@ class _Reader:
         return tuple(found)
 
     def _door(self, item: dict[str, Any], where: str, names: dict[str, int]) -> Door:
-        sides = self._named(item, "regions", where, names)
+        sides = self._named(item, "rooms", where, names)
         if len(sides) != 2 or sides[0] == sides[1]:
             self._refuse("are not two regions", f"{where}.regions")
         width = float(self._numbers(item, "width", (), where))
@@ -235,7 +235,7 @@ class _Reader:
         door_names: dict[str, int],
         doors: Sequence[Door],
     ) -> Region:
-        where = f"regions[{index}]"
+        where = f"rooms[{index}]"
         kind = self._member(item, "kind", str, where)
         if kind not in REGION_KINDS:
             self._refuse(f"is none of {', '.join(REGION_KINDS)}", f"{where}.kind")

@@ -9,6 +9,9 @@ from jaxslam.io.geojson import FRONTIER, KINDS, Arc, Node
 from jaxslam.io.nav2_metadata import door_operations, edge_metadata, node_metadata
 from jaxslam.io.route_labels import Label, arc_clearances, labels
 
+FILLED = {"filled": True}
+"""Metadata of an arc through open space, which is no branch of the Voronoi diagram."""
+
 
 def route_graph(
     graph: TopologicalMap,
@@ -40,7 +43,7 @@ def route_graph(
         clearance = float(clearance) if kind == JUNCTION else np.nan
         own = node_metadata(label)
         nodes.append(Node(int(node), float(x), float(y), KINDS[kind], clearance, metadata=own))
-    arcs = []
+    arcs, filled = [], set(np.flatnonzero(graph.arc_filled).tolist())
     for index, (start, end) in enumerate(graph.arc_ends):
         label, clearance = of_arcs[index], float(clearances[index])
         arc = Arc(
@@ -50,7 +53,7 @@ def route_graph(
             float(graph.arc_length[index]),
             clearance,
             graph.arc_lines[index],
-            metadata=edge_metadata(label, clearance),
+            metadata=edge_metadata(label, clearance) | (FILLED if index in filled else {}),
             operations=door_operations(label) if with_operations else {},
         )
         arcs.append(arc)

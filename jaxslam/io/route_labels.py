@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core.maps import TopologicalMap
-from jaxslam.core.regions import PlannerData, Regions
+from jaxslam.core.regions import Door, PlannerData, Regions
 
 DOOR = "door"  # class of an arc that passes through a door
 FULL_SPEED_CLEARANCE = 0.8  # [m] distance to obstacles from which on the speed is full
+MAX_LEAF_WIDTH = 1.5  # [m] widest door that is opened
 LEAST_SPEED = 0.2  # fraction of the full speed, also where the clearance is not known
 
 
@@ -24,11 +25,18 @@ class Label(NamedTuple):
         region: Name of the region that it lies in, empty for none.
         kind: Kind of that region, or `DOOR`; empty for none.
         doors: Names of the doors that an arc passes through, in its direction.
+        leaves: Of these, the ones that are narrow enough for a door leaf, to be opened.
     """
 
     region: str = ""
     kind: str = ""
     doors: tuple[str, ...] = ()
+    leaves: tuple[str, ...] = ()
+
+
+def has_leaf(door: Door) -> bool:
+    """Whether a door may have a leaf that opens; a wider one is an opening."""
+    return door.width <= MAX_LEAF_WIDTH
 
 
 def speed_fraction(clearance: float) -> float:
@@ -70,8 +78,9 @@ def labels(
     arcs = []
     for index, doors in zip(planner.arc_region, planner.arc_doors, strict=True):
         label = _of_region(regions, int(index))
-        names = tuple(regions.doors[door].name for door in doors)
-        arcs.append(label._replace(kind=DOOR, doors=names) if names else label)
+        passed = [regions.doors[door] for door in doors]
+        names, leaves = tuple(d.name for d in passed), tuple(d.name for d in passed if has_leaf(d))
+        arcs.append(label._replace(kind=DOOR, doors=names, leaves=leaves) if names else label)
     return tuple(_of_region(regions, int(k)) for k in planner.node_region), tuple(arcs)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import Door, PlannerData, Regions
 from jaxslam.core.types import JUNCTION, as_float64
-from jaxslam.io.route_labels import Label, arc_clearances, labels, speed_fraction
+from jaxslam.io.route_labels import Label, arc_clearances, has_leaf, labels, speed_fraction
 
 TOLERANCE = 0.1  # [m] largest distance of a lane from its arc
 DOOR_MARGIN = 1.0  # [m] of an arc on either side of a door that its lanes open the door for
@@ -91,6 +91,7 @@ def straight_lanes(
         line[0], line[-1] = xy[start], xy[end]
         numbers = () if regions is None or planner is None else planner.arc_doors[arc]
         found = [] if regions is None else [regions.doors[k] for k in dict.fromkeys(numbers)]
+        found = [door for door in found if has_leaf(door)]
         line, doors = _with_doors(simplified(line, tolerance), found)
         if len(line) == 2 and start == end:
             continue  # a loop within the tolerance

@@ -47,7 +47,7 @@ def test_the_picture_has_a_pixel_for_each_cell(written):
     pixels, label = np.asarray(picture), two_regions().label
     assert picture.mode == "RGB" and pixels.shape == (5, 7, 3)
     content = json.loads((written / "rooms.json").read_text())
-    colours = np.array([[0, 0, 0], *(region["colour"] for region in content["regions"])])
+    colours = np.array([[0, 0, 0], *(region["colour"] for region in content["rooms"])])
     np.testing.assert_array_equal(pixels[::-1].transpose(1, 0, 2), colours[label])
 
 
@@ -81,32 +81,32 @@ WRONG = [
     (("resolution",), 0, "resolution"),
     (("resolution",), "1", "resolution"),
     (("origin",), [0, 0], "origin"),
-    (("regions",), {}, "regions"),
-    (("regions", 0), 3, "regions[0]"),
-    (("regions", 0, "name"), "room_7", "twice"),
-    (("regions", 0, "name"), "door_2", "room_N"),
-    (("regions", 0, "name"), "kitchen", "room_N"),
-    (("regions", 0, "name"), 5, "name"),
-    (("regions", 0, "kind"), "kitchen", "room, corridor, hall"),
-    (("regions", 1, "polygon"), [[0, 0], [1, 1]], "fewer than 3"),
-    (("regions", 1, "polygon", 0), [0, 0, 0], "polygon"),
-    (("regions", 1, "polygon", 0), [0, True], "polygon"),
-    (("regions", 1, "polygon", 0, 1), 1e12, "polygon"),
-    (("regions", 1, "polygon"), None, "polygon"),
-    (("regions", 1, "area"), 0.0, "area"),
-    (("regions", 1, "area"), None, "area"),
-    (("regions", 1, "doors"), ["door_5"], "door_5"),
-    (("regions", 1, "doors"), [], "doors that name it"),
-    (("regions", 1, "neighbours"), [], "behind its doors"),
-    (("regions", 1, "neighbours"), [["room_2"]], "not in the file"),
+    (("rooms",), {}, "rooms"),
+    (("rooms", 0), 3, "rooms[0]"),
+    (("rooms", 0, "name"), "room_7", "twice"),
+    (("rooms", 0, "name"), "door_2", "room_N"),
+    (("rooms", 0, "name"), "kitchen", "room_N"),
+    (("rooms", 0, "name"), 5, "name"),
+    (("rooms", 0, "kind"), "kitchen", "room, corridor, hall"),
+    (("rooms", 1, "polygon"), [[0, 0], [1, 1]], "fewer than 3"),
+    (("rooms", 1, "polygon", 0), [0, 0, 0], "polygon"),
+    (("rooms", 1, "polygon", 0), [0, True], "polygon"),
+    (("rooms", 1, "polygon", 0, 1), 1e12, "polygon"),
+    (("rooms", 1, "polygon"), None, "polygon"),
+    (("rooms", 1, "area"), 0.0, "area"),
+    (("rooms", 1, "area"), None, "area"),
+    (("rooms", 1, "doors"), ["door_5"], "door_5"),
+    (("rooms", 1, "doors"), [], "doors that name it"),
+    (("rooms", 1, "neighbours"), [], "behind its doors"),
+    (("rooms", 1, "neighbours"), [["room_2"]], "not in the file"),
     (("doors", 0, "name"), "door_5", "door_N with N up to 4"),
     (("doors", 0, "position"), [0.0], "position"),
     (("doors", 0, "jambs"), [[0.0, 1.0]], "jambs"),
     (("doors", 0, "width"), -0.1, "width"),
-    (("doors", 0, "regions"), ["room_2"], "two regions"),
-    (("doors", 0, "regions"), ["room_2", "room_2"], "two regions"),
-    (("doors", 0, "regions"), ["room_2", "room_3"], "room_3"),
-    (("doors", 0, "regions"), "room_2", "regions"),
+    (("doors", 0, "rooms"), ["room_2"], "two regions"),
+    (("doors", 0, "rooms"), ["room_2", "room_2"], "two regions"),
+    (("doors", 0, "rooms"), ["room_2", "room_3"], "room_3"),
+    (("doors", 0, "rooms"), "room_2", "rooms"),
 ]
 
 
@@ -134,7 +134,7 @@ def test_a_malformed_file_is_refused_in_one_line(written, keys, value, problem):
 def test_a_missing_key_is_refused_in_one_line(written):
     text = (written / "rooms.json").read_text()
     free = {"frame", "units", "colour"}  # for users, not read back
-    for path in ((), ("last_numbers",), ("regions", 0), ("doors", 0)):
+    for path in ((), ("last_numbers",), ("rooms", 0), ("doors", 0)):
         whole = json.loads(text)
         place = whole
         for key in path:

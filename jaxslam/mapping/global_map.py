@@ -117,9 +117,9 @@ def build_global_map(
     xy = np.array(graph.xy)
     ids = np.full(len(xy), -1)
     ids[list(landmarks)] = merged.id[junctions[list(landmarks.values())]]
-    ids, next_id = kept_ids(ids, xy, previous, next_id)
-    lines = tuple(line.points for line in graph.arcs.values())
     corners = np.flatnonzero(merged.kind == CORNER)
+    ids, next_id = kept_ids(ids, xy, _without(previous, merged.id[corners]), next_id)
+    lines = tuple(line.points for line in graph.arcs.values())
     result = TopologicalMap(
         id=np.concatenate([ids, merged.id[corners]]),
         xy=np.concatenate([xy, merged.xy[corners]]),
@@ -186,6 +186,14 @@ def _reached(space: FreeConfigurations, occupancy: OccupancyMap, poses: np.ndarr
     counts = np.bincount(space.region[tuple(cell.T)], minlength=int(space.region.max()) + 1)
     counts[0] = 0
     return (counts >= max(1.0, MIN_SHARE * len(xy)))[space.region]
+
+
+def _without(previous: TopologicalMap | None, ids: np.ndarray) -> TopologicalMap | None:
+    """The nodes of an earlier map that are no corners and have none of some ids."""
+    if previous is None:
+        return None
+    kept = (previous.kind == JUNCTION) & ~np.isin(previous.id, ids)
+    return previous._replace(id=previous.id[kept], xy=previous.xy[kept])
 
 
 def _open_ends(

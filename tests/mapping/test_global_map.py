@@ -161,3 +161,16 @@ def test_corner_junctions_are_nodes_where_that_is_asked_for():
     order = np.argsort(found.xy[:, 0])
     np.testing.assert_allclose(found.xy[order], [[2.5, 2.5], [5.5, 2.5]], atol=1.5 * CELL)
     assert np.sort(found.arc_ends, axis=1).tolist() == [[0, 1]]
+
+
+def test_no_node_takes_the_id_of_a_corner():
+    before = build_global_map(
+        drawn(*T_SHAPE), DRIVE, landmarks([[1.0, 3.0]], [0.0], [4], CORNER), 20
+    )
+    near = before.graph.xy[0] + 0.1  # a corner is there now, with the id of a node before
+    corners = landmarks([near], [0.0], [before.graph.id[0]], CORNER)
+    grid, next_id = drawn(*T_SHAPE), before.next_id
+    graph = build_global_map(grid, DRIVE, corners, next_id, previous=before.graph).graph
+    assert len(np.unique(graph.id)) == len(graph.id)
+    assert graph.kind[graph.id == before.graph.id[0]].tolist() == [CORNER]
+    assert 4 not in graph.id  # nor does a node take that of an earlier corner

@@ -6,6 +6,9 @@ from jaxslam.mapping.arc_table import ArcTable as ArcTable
 from jaxslam.mapping.arc_table import add_scan_arcs as add_scan_arcs
 from jaxslam.mapping.arc_table import empty_arcs as empty_arcs
 from jaxslam.mapping.arc_table import grow_arcs as grow_arcs
+from jaxslam.mapping.config import MappingSpec as MappingSpec
+from jaxslam.mapping.global_map import GlobalMap as GlobalMap
+from jaxslam.mapping.global_map import build_global_map as build_global_map
 from jaxslam.mapping.grid_topology import GridTopology as GridTopology
 from jaxslam.mapping.grid_topology import extract_topology as extract_topology
 from jaxslam.mapping.occupancy import occupancy_map as occupancy_map
@@ -14,6 +17,7 @@ from jaxslam.mapping.planning import drivable as drivable
 from jaxslam.mapping.planning import route as route
 from jaxslam.mapping.pose_graph import PoseGraph as PoseGraph
 from jaxslam.mapping.pose_graph import build_pose_graph as build_pose_graph
+from jaxslam.mapping.rooms import find_regions as find_regions
 from jaxslam.mapping.routes import Route as Route
 from jaxslam.mapping.routes import find_route as find_route
 from jaxslam.mapping.routes import shortest_path as shortest_path

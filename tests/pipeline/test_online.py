@@ -7,24 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core import se2_np
+from jaxslam.core import polylines, se2_np
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2 import unit_vector
 from jaxslam.core.se2_np import increments, relative
-from jaxslam.core.types import WALL
+from jaxslam.core.types import CORNER, WALL
 from jaxslam.filtering import config as filter_config
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract
 from jaxslam.mapping import arc_table
+from jaxslam.mapping.config import MappingSpec
 from jaxslam.matching import loop_closure, scan_matching
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.matching.registration import LoopClosureSpec
 from jaxslam.pipeline import chunks, offline, online, smoothing_stage
 from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.online import SlamState
 from jaxslam.simulation import ray_casting, worlds
 from jaxslam.simulation.worlds import World
 from jaxslam.smoothing import numbering, problem, sparse
@@ -203,6 +205,48 @@ def test_the_callback_is_called_after_each_chunk(results):
     np.testing.assert_array_equal(after[0][0].belief.pose, found.info.pose[3])
     np.testing.assert_array_equal(after[1][1].info.id, found.info.id[4:8])
     assert_close(after[-1][0].belief, found.belief)
+
+
+def test_the_map_at_the_end_is_of_all_scans(drive, results):
+    found = results[True][0]
+    graph, grid = found.topological_map, found.occupancy
+    assert len(graph.arc_ends) and found.next_id >= int(found.belief.next_id)
+    ends = np.concatenate([graph.arc_ends.ravel(), np.flatnonzero(graph.kind == CORNER)])
+    assert set(ends.tolist()) == set(range(len(graph.id)))  # every node is joined
+    for line in graph.arc_lines:
+        points = polylines.resample(line, 200)
+        # This robot drives through the end of a wall.
+        points = points[polylines.project(points, found.poses[:, :2])[0] > 0.2]
+        cell = np.floor((points - grid.origin[:2]) / grid.resolution)
+        assert not grid.occupied[tuple(cell.astype(int).T)].any()
+    landmarks = np.asarray(found.belief.id)[np.asarray(found.belief.num_seen) > 0]
+    fresh = graph.id[~np.isin(graph.id, landmarks)]
+    assert (fresh >= int(found.belief.next_id)).all() and (fresh < found.next_id).all()
+
+
+def test_the_merged_map_is_that_of_the_state(drive, results):
+    merged = CONFIG._replace(mapping=MappingSpec("merged"))
+    found = offline.run_slam(merged, PARAMS, *drive, start=START, smooth=False)
+    state = SlamState(found.belief, found.arcs, None)
+    expected = online.topological_map(merged, state, found.poses)
+    for ours, wanted in zip(found.topological_map, expected, strict=True):
+        for one, other in zip(ours, wanted, strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert found.next_id == int(found.belief.next_id)
+    np.testing.assert_array_equal(found.occupancy.free.shape, results[True][0].occupancy.free.shape)
+
+
+@pytest.mark.parametrize(
+    "spec, problem",
+    [
+        (MappingSpec("whole"), "mapping.topology is 'whole', not 'grid' or 'merged'"),
+        (MappingSpec(robot_radius=-1.0), "mapping.robot_radius is -1.0, not a positive"),
+        (3, "mapping is a int, not a MappingSpec"),
+    ],
+)
+def test_a_map_that_cannot_be_made_is_refused(drive, spec, problem):
+    with pytest.raises(ValueError, match=problem):
+        offline.run_slam(CONFIG._replace(mapping=spec), PARAMS, *drive)
 
 
 def test_scans_may_come_in_any_portions(drive, results):

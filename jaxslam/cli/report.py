@@ -38,8 +38,6 @@ from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.results import SlamResult
 from jaxslam.pipeline.saving import to_saved_map
 from jaxslam.simulation.worlds import World
-from jaxslam.tuning.fitting import TuneResult
-from jaxslam.tuning.parameters import param_names
 
 
 def write_results(
@@ -310,17 +308,4 @@ def draw_route(
     routes.draw_route(axis, planned)
     maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
     canvas.legend(figure)
-    figure.savefig(path)
-
-
-def draw_history(path: Path, found: TuneResult) -> None:
-    """Draw losses and parameters over the evaluations of a tuning."""
-    from jaxslam.viz import canvas, charts  # imported here, because matplotlib is slow to import
-
-    figure, axes = canvas.canvas(11.0, 4.0, 1, 2)
-    charts.draw_losses(axes[0, 0], found.loss, found.heldout, found.best)
-    values = [np.asarray(x).reshape(len(found.loss), -1) for x in jax.tree.leaves(found.history)]
-    charts.draw_parameters(
-        axes[0, 1], param_names(found.params), np.concatenate(values, axis=1), found.best
-    )
     figure.savefig(path)

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import report, summaries
+from jaxslam.cli import summaries
 from jaxslam.cli.options import (
     Files,
     OptionalCount,
@@ -152,7 +152,7 @@ def tune(
         numbers |= {"seconds": seconds}
         noise_file.write(out_dir / PARAMS_FILE, found.params)
         write_json(out_dir / "metrics.json", numbers)
-        report.draw_history(out_dir / "history.png", found)
+        _draw_history(out_dir / "history.png", found)
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)
     summaries.print_tuning_summary(numbers, job.title, out)
 
@@ -267,3 +267,16 @@ def _hash(episodes: Episode | None) -> str:
     for leaf in jax.tree.leaves(episodes):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()[:16]
+
+
+def _draw_history(path: Path, found: TuneResult) -> None:
+    """Draw losses and parameters over the evaluations of a tuning."""
+    from jaxslam.viz import canvas, charts  # imported here, because matplotlib is slow to import
+
+    figure, axes = canvas.canvas(11.0, 4.0, 1, 2)
+    charts.draw_losses(axes[0, 0], found.loss, found.heldout, found.best)
+    values = [np.asarray(x).reshape(len(found.loss), -1) for x in jax.tree.leaves(found.history)]
+    charts.draw_parameters(
+        axes[0, 1], parameters.param_names(found.params), np.concatenate(values, axis=1), found.best
+    )
+    figure.savefig(path)

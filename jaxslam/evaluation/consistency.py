@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from jaxslam.core.se2 import wrap_angle
 from jaxslam.core.types import AnyArray, Array, as_float
@@ -116,6 +115,8 @@ def chi_square_bounds(dof: int, count: int, probability: float = 0.95) -> tuple[
     Raises:
         ValueError: An argument is out of its range.
     """
+    from scipy.special import chdtri  # imported here, because it is slow to import
+
     for name, number in (("dof", dof), ("count", count)):
         if number < 1:
             raise ValueError(f"{name} is {number}, not a number >= 1")

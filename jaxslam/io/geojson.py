@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam.io.output import write_json
+from jaxslam.io.output import write_json_rows
 
 FRONTIER = "frontier"
 KINDS = ("node", "corner", "wall", FRONTIER)
@@ -112,7 +112,7 @@ def write(
         written.append(_edge_feature(back, arc.end, arc.start, arc, points[::-1], own_back))
     _check_ids(written)
     content = {"type": "FeatureCollection", "name": "graph"} | dict(members)
-    write_json(path, content | {"features": [*written, *features]})
+    write_json_rows(path, content | {"features": [*written, *features]})
 
 
 def _check_ids(features: Sequence[Mapping[str, Any]]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
-from jaxslam.io.output import write_json
+from jaxslam.io.output import write_json_rows
 from jaxslam.io.route_labels import Label
 from jaxslam.io.straight_lanes import Lane, StraightLanes, straight_lanes
 
@@ -70,7 +70,7 @@ def write(
             }
         ],
     }
-    write_json(path, content)
+    write_json_rows(path, content)
 
 
 def _nodes(layout: StraightLanes, vehicle_type: str, map_id: str) -> list[dict[str, Any]]:

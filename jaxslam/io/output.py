@@ -119,6 +119,21 @@ def write_json(path: str | PathLike, value: Any) -> None:
     write_text(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
+def write_json_rows(path: str | PathLike, members: Mapping[str, Any]) -> None:
+    """As `write_json`, of an object whose lists are long: an item of a list is one line.
+
+    It is several times as fast, and the file is smaller.
+    """
+    text = []
+    for name, member in plain(members).items():
+        own = json.dumps(member, allow_nan=False)
+        if isinstance(member, list) and member:
+            rows = [json.dumps(row, allow_nan=False) for row in member]
+            own = "[\n" + ",\n".join(rows) + "\n]"
+        text.append(f"{json.dumps(name)}: {own}")
+    write_text(path, "{\n" + ",\n".join(text) + "\n}\n")
+
+
 def plain(value: Any) -> Any:
     """Convert a value to what JSON can hold: dicts, lists, numbers, strings, None.
 

@@ -24,7 +24,7 @@ import numpy as np
 from jaxslam.core.regions import REGION_KINDS, Door, Region, Regions
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
-from jaxslam.io.output import replace, write_json
+from jaxslam.io.output import replace, write_json_rows
 from jaxslam.mapping.region_names import number_of
 
 JSON_NAME, PNG_NAME = "rooms.json", "rooms.png"
@@ -79,7 +79,7 @@ def write_rooms(folder: str | PathLike, regions: Regions) -> None:
     picture = Image.fromarray(np.ascontiguousarray(palette[regions.label.T[::-1]]))
     with replace(Path(folder) / PNG_NAME) as file:
         picture.save(file, format="PNG")
-    write_json(Path(folder) / JSON_NAME, content)
+    write_json_rows(Path(folder) / JSON_NAME, content)
 
 
 def region_colours(regions: Regions) -> np.ndarray:

@@ -96,20 +96,21 @@ def doors_crossed(doors: tuple[Door, ...], line: np.ndarray) -> list[tuple[int, 
     Returns:
         For each, the index of the polyline's segment and that of the door.
     """
-    start, step = line[:-1], np.diff(line, axis=0)
-    crossed: list[tuple[float, int]] = []
-    for k, door in enumerate(doors):
-        low, high = door.jambs
-        across = (high - low) / max(float(np.hypot(*(high - low))), 1e-9)
-        low, high = low - DOOR_MARGIN * across, high + DOOR_MARGIN * across
-        # start + s step = low + t (high - low)
-        cross = _cross(step, high - low)
-        parallel = np.abs(cross) < 1e-12
-        cross = np.where(parallel, 1.0, cross)
-        s, t = _cross(low - start, high - low) / cross, _cross(low - start, step) / cross
-        hit = np.flatnonzero(~parallel & (s >= 0) & (s < 1) & (t >= 0) & (t <= 1))
-        crossed += [(float(segment + s[segment]), k) for segment in hit]
-    return [(int(at), k) for at, k in sorted(crossed)]
+    if not doors:
+        return []
+    low, high = np.array([door.jambs for door in doors], float).swapaxes(0, 1)  # each (D, 2)
+    width = np.hypot(*(high - low).T)[:, None]
+    across = DOOR_MARGIN * (high - low) / np.maximum(width, 1e-9)
+    low, high = low - across, high + across
+    start, step = line[:-1, None], np.diff(line, axis=0)[:, None]  # (n - 1, 1, 2)
+    # start + s step = low + t (high - low)
+    cross = _cross(step, high - low)
+    parallel = np.abs(cross) < 1e-12
+    cross = np.where(parallel, 1.0, cross)
+    s, t = _cross(low - start, high - low) / cross, _cross(low - start, step) / cross
+    segment, door = np.nonzero(~parallel & (s >= 0) & (s < 1) & (t >= 0) & (t <= 1))
+    order = np.lexsort((door, segment + s[segment, door]))
+    return [(int(segment[k]), int(door[k])) for k in order]
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

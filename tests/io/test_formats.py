@@ -394,3 +394,12 @@ def test_a_long_table_is_refused_as_a_short_one(tmp_path, content):
     path = save(tmp_path / "a.dat", content)
     said = [complaint(read, path, ("a", "b"), "pairs") for read in (text.rows, text.table)]
     assert said[0] == said[1]
+
+
+def test_json_in_rows_is_the_same_json(tmp_path):
+    content = {"a": [{"b": [1, float("nan")]}, 2.5], "c": [], "d": {"e": np.arange(3)}, "f": "g\n"}
+    output.write_json(tmp_path / "a.json", content)
+    output.write_json_rows(tmp_path / "b.json", content)
+    one, other = ((tmp_path / name).read_text() for name in ("a.json", "b.json"))
+    assert json.loads(one) == json.loads(other)
+    assert other.splitlines()[:3] == ["{", '"a": [', '{"b": [1, null]},']

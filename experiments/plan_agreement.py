@@ -11,7 +11,7 @@ from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.se2_np import transform
 
 NEAR = 0.2  # [m] between a node and the true one
-BESIDE = 0.3  # [m] between an arc and the true one, everywhere
+BESIDE = 0.2  # [m] between an arc and the true one, on average
 
 
 class Agreement(NamedTuple):
@@ -61,12 +61,21 @@ def branches_of(graph: TopologicalMap, frame: np.ndarray) -> PlanGraph:
         clearance=graph.clearance[names],
         ends=np.array([[rank[a], rank[b]] for a, b, _ in arcs.values()], int).reshape(-1, 2),
         lines=tuple(transform(frame, line) for _, _, line in arcs.values()),
+        junctions=tuple(transform(frame, graph.xy[[name]]) for name in names),
     )
 
 
 def agreement(true: PlanGraph, found: PlanGraph) -> Agreement:
-    """Nodes that lie within `NEAR` of each other, and arcs between these that lie beside."""
-    away = np.hypot(*(true.xy[:, None] - found.xy[None]).transpose(2, 0, 1))
+    """Nodes that lie within `NEAR` of each other, and arcs between these that lie beside.
+
+    A true node that stands for several junctions is where any of them is.
+    """
+    away = np.array(
+        [
+            np.hypot(*(places[:, None] - found.xy[None]).transpose(2, 0, 1)).min(axis=0)
+            for places in true.junctions
+        ]
+    ).reshape(len(true.xy), len(found.xy))
     node, error = np.full(len(true.xy), -1), np.full(len(true.xy), np.nan)
     if away.size:
         rows, columns = linear_sum_assignment(np.minimum(away, 2 * NEAR))
@@ -79,7 +88,13 @@ def agreement(true: PlanGraph, found: PlanGraph) -> Agreement:
         wanted = np.sort(node[ends])
         options = np.flatnonzero((pairs == wanted).all(axis=1) & (wanted[0] >= 0))
         options = options[~np.isin(options, arc)]
-        gaps = [polylines.project(line, found.lines[n])[0].max() for n in options.tolist()]
+        gaps = [mean_gap(line, found.lines[n]) for n in options.tolist()]
         if gaps and min(gaps) <= BESIDE:
             arc[k] = options[int(np.argmin(gaps))]
     return Agreement(node, arc, error)
+
+
+def mean_gap(line: np.ndarray, other: np.ndarray) -> float:
+    """Mean distance [m] of a polyline (n, 2) [m] from another."""
+    dense = polylines.refine(line, 0.05)
+    return float(polylines.project(dense, other)[0].mean())

@@ -76,12 +76,14 @@ class PlanGraph(NamedTuple):
         clearance: (N,) [m].
         ends: (A, 2) int nodes of each arc.
         lines: A polylines (n, 2) [m].
+        junctions: N arrays (k, 2) [m], the junctions that each node stands for.
     """
 
     xy: np.ndarray
     clearance: np.ndarray
     ends: np.ndarray
     lines: tuple[np.ndarray, ...]
+    junctions: tuple[np.ndarray, ...]
 
 
 def branches(walls: np.ndarray) -> Branches:
@@ -107,7 +109,7 @@ def plan_graph(found: Branches, start: np.ndarray, rules: Rules = Rules()) -> Pl
     pairs, wide = _reached(found.xy, pairs, wide, start)
     pairs = _without_narrow_ends(pairs, wide, len(found.xy))
     arcs = _traced(pairs, found.clearance)
-    _clean_up(arcs, found, rules)
+    stands_for = _clean_up(arcs, found, rules)
     names = sorted({node for arc in arcs for node in arc.ends})
     rank = {node: n for n, node in enumerate(names)}
     return PlanGraph(
@@ -115,6 +117,7 @@ def plan_graph(found: Branches, start: np.ndarray, rules: Rules = Rules()) -> Pl
         clearance=found.clearance[names],
         ends=np.array([[rank[node] for node in arc.ends] for arc in arcs], int).reshape(-1, 2),
         lines=tuple(found.xy[arc.path] for arc in arcs),
+        junctions=tuple(found.xy[[node, *stands_for[node]]] for node in names),
     )
 
 
@@ -184,15 +187,20 @@ def _at_nodes(arcs: list[PlanArc]) -> dict[int, list[PlanArc]]:
     return at
 
 
-def _clean_up(arcs: list[PlanArc], found: Branches, rules: Rules) -> None:
-    """Drop spurs, join arcs through nodes of degree 2, make close junctions one; in place."""
-    before = -1
+def _clean_up(arcs: list[PlanArc], found: Branches, rules: Rules) -> dict[int, list[int]]:
+    """Drop spurs, join arcs through nodes of degree 2, make close junctions one; in place.
+
+    Returns:
+        The junctions that became one with each other one.
+    """
+    before, stands_for = -1, defaultdict(list)
     while before != len(arcs):
         before = len(arcs)
         while _drop_spurs(arcs, found, rules):
             _join(arcs)
         _join(arcs)
-        _merge(arcs, found, rules)
+        _merge(arcs, found, rules, stands_for)
+    return stands_for
 
 
 def _drop_spurs(arcs: list[PlanArc], found: Branches, rules: Rules) -> bool:
@@ -227,8 +235,10 @@ def _join(arcs: list[PlanArc]) -> None:
             arcs.append(PlanArc((path[0], path[-1]), path))
 
 
-def _merge(arcs: list[PlanArc], found: Branches, rules: Rules) -> None:
-    """Move the arcs of a junction to one close by, of larger clearance."""
+def _merge(
+    arcs: list[PlanArc], found: Branches, rules: Rules, stands_for: dict[int, list[int]]
+) -> None:
+    """Move the arcs of a junction to one close by, of larger clearance, and note which."""
     clearance = found.clearance
     for arc in sorted(arcs, key=lambda one: _length(found.xy, one.path)):
         lost, kept = sorted(arc.ends, key=lambda v: clearance[v])
@@ -238,6 +248,7 @@ def _merge(arcs: list[PlanArc], found: Branches, rules: Rules) -> None:
         at = _at_nodes(arcs)
         if len(at[lost]) < 3 or len(at[kept]) < 3:
             continue
+        stands_for[kept] += [lost, *stands_for[lost]]
         bridge = _from(arc, kept)
         arcs.remove(arc)
         for other in [one for one in arcs if lost in one.ends]:

@@ -8,7 +8,7 @@ with that of the shortest path over the free cells.
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from experiments.common import Numbers
@@ -49,7 +49,46 @@ def free_places(rng: np.random.Generator, ground: Ground, num_pairs: int) -> Pla
     return choose_places(rng, ground.points(np.argwhere(region == size.argmax())), num_pairs)
 
 
-def measure(ground: Ground, roadmap: Roadmap, places: Places) -> Numbers:
+class Judge(NamedTuple):
+    """The shortest paths over the free cells, with which routes over a graph are compared.
+
+    Attributes:
+        ground: The free space.
+        number: (H, W) int of each cell where the robot fits, -1 elsewhere.
+        grid: (C, C) [m] adjacency of these cells.
+        nearest: (2, H, W) int the cell where the robot fits that is nearest to each.
+        places: (K,) int cells of the places.
+        pairs: (M, 2) int start and goal among the places, ordered by start.
+        direct: (M,) [m] shortest path between them; infinite where there is none.
+    """
+
+    ground: Ground
+    number: np.ndarray
+    grid: sparse.csr_array
+    nearest: np.ndarray
+    places: np.ndarray
+    pairs: np.ndarray
+    direct: np.ndarray
+
+    def cells(self, points: np.ndarray) -> np.ndarray:
+        """Number (P,) of the cell where the robot fits that is nearest to points (P, 2) [m]."""
+        return self.number[tuple(self.nearest[:, *self.ground.cells(points)[0].T])]
+
+
+def judge(ground: Ground, places: Places) -> Judge:
+    """The judge of routes between some places."""
+    number, grid = grid_graph(ground.fits, ground.resolution)
+    nearest = ndimage.distance_transform_edt(~ground.fits, return_indices=True)[1]
+    pairs = places.pairs[np.argsort(places.pairs[:, 0], kind="stable")]
+    new = Judge(ground, number, grid, nearest, np.zeros(0, int), pairs, np.zeros(0))
+    at, direct = new.cells(places.xy), []
+    for start in np.unique(pairs[:, 0]).tolist():
+        away = csgraph.dijkstra(grid, directed=False, indices=at[start])
+        direct.append(away[at[pairs[pairs[:, 0] == start, 1]]])
+    return new._replace(places=at, direct=np.concatenate(direct))
+
+
+def measure(by: Judge, roadmap: Roadmap) -> Numbers:
     """Structure of a graph, how much of its arcs is blocked, and routes between places.
 
     Returns:
@@ -57,7 +96,7 @@ def measure(ground: Ground, roadmap: Roadmap, places: Places) -> Numbers:
         apart. `blocked`: share of the length of arcs that is in obstacles or unknown space.
         `reach`: share of the places from which the largest part is within `NEAR` of free path.
         `covered`: share of the cells where the robot fits that have the largest part within
-        `COVERED` of free path, of their region. `routed`: share of the pairs further apart than
+        `COVERED` of free path, of its region. `routed`: share of the pairs further apart than
         `MIN_APART` that the graph joins; `detour`: length of their routes by that of the shortest
         path.
     """
@@ -67,7 +106,7 @@ def measure(ground: Ground, roadmap: Roadmap, places: Places) -> Numbers:
     part = csgraph.connected_components(matrix, directed=False)[1]
     with_arcs = np.unique(roadmap.ends)
     sizes = np.bincount(part[with_arcs], minlength=part.max(initial=0) + 1)
-    free = ground.at(ground.known_free, chains.middles())
+    free = by.ground.at(by.ground.known_free, chains.middles())
     total = float(chains.length.sum())
     lonely = ~np.isin(np.arange(len(roadmap.xy)), with_arcs) & ~roadmap.is_open
     structure: Numbers = {
@@ -78,55 +117,41 @@ def measure(ground: Ground, roadmap: Roadmap, places: Places) -> Numbers:
         "length_m": total,
         "blocked": float(chains.length[~free].sum()) / max(total, 1e-9),
     }
-    return structure | _routes(ground, chains, matrix, part == sizes.argmax(), places)
+    if not len(chains.edges):
+        return structure | {"reach": 0.0, "covered": 0.0, "routed": 0.0} | _detours(np.zeros(0))
+    return structure | _routes(by, chains, matrix, np.flatnonzero(part == sizes.argmax()))
 
 
-def _routes(ground: Ground, chains: Chains, matrix, largest: np.ndarray, places: Places) -> Numbers:
-    """The numbers of `measure` that need paths; `largest` (P,) bool is the largest part."""
-    number, grid = grid_graph(ground.fits, ground.resolution)
-    if not len(chains.edges) or not grid.shape[0]:
-        return {"reach": 0.0, "covered": 0.0, "routed": 0.0, **_detours(np.zeros(0))}
-    nearest = ndimage.distance_transform_edt(~ground.fits, return_indices=True)[1]
-
-    def cell_of(points: np.ndarray) -> np.ndarray:
-        """Number (P,) of the free cell that is nearest to each point."""
-        return number[tuple(nearest[:, *ground.cells(points)[0].T])]
-
-    points = np.flatnonzero(largest)
-    sources, first = np.unique(cell_of(chains.xy[points]), return_index=True)
+def _routes(by: Judge, chains: Chains, matrix: sparse.csr_array, largest: np.ndarray) -> Numbers:
+    """The numbers of `measure` that need paths; `largest` holds the points of the largest part."""
+    sources, first = np.unique(by.cells(chains.xy[largest]), return_index=True)
     to_graph, _, source = csgraph.dijkstra(
-        grid,
+        by.grid,
         directed=False,
         indices=sources,
         min_only=True,
         limit=NEAR,
         return_predecessors=True,
     )
-    entry_at = np.full(grid.shape[0], -1)
-    entry_at[sources] = points[first]
-    at = cell_of(places.xy)
-    entry = np.where(np.isfinite(to_graph[at]), entry_at[source[at]], -1)
-    region = csgraph.connected_components(grid, directed=False)[1]
-    same = np.isin(region, region[sources])
-    ratios, possible = [], 0
-    for start in np.unique(places.pairs[:, 0]).tolist():
-        goals = places.pairs[places.pairs[:, 0] == start, 1]
-        direct = csgraph.dijkstra(grid, directed=False, indices=at[start])[at[goals]]
-        wanted = np.isfinite(direct) & (direct >= MIN_APART)
-        possible += int(wanted.sum())
-        if entry[start] < 0:
-            continue
-        along = csgraph.dijkstra(matrix, directed=False, indices=entry[start])
-        goals, direct = goals[wanted], direct[wanted]
-        route = to_graph[at[start]] + along[entry[goals]] + to_graph[at[goals]]
-        joined = (entry[goals] >= 0) & np.isfinite(route)
-        ratios += (route[joined] / direct[joined]).tolist()
+    entry_at = np.full(by.grid.shape[0], -1)
+    entry_at[sources] = largest[first]
+    reached = np.isfinite(to_graph[by.places])
+    entry = np.where(reached, entry_at[source[by.places]], -1)
+    to_graph_of = to_graph[by.places]
+    region = csgraph.connected_components(by.grid, directed=False)[1]
+    wanted = np.isfinite(by.direct) & (by.direct >= MIN_APART)
+    possible = wanted & reached[by.pairs].all(axis=1)
+    starts, goals = by.pairs[possible].T
+    entries, back = np.unique(entry[starts], return_inverse=True)
+    along = csgraph.dijkstra(matrix, directed=False, indices=entries)[back, entry[goals]]
+    route = to_graph_of[starts] + along + to_graph_of[goals]
+    joined = np.isfinite(route)
     return {
-        "reach": float(np.isfinite(to_graph[at]).mean()),
-        "covered": float((to_graph[same] <= COVERED).mean()),
-        "routed": len(ratios) / max(possible, 1),
-        "pairs": possible,
-        **_detours(np.array(ratios)),
+        "reach": float(reached.mean()),
+        "covered": float((to_graph <= COVERED)[np.isin(region, region[sources])].mean()),
+        "routed": float(joined.sum() / max(wanted.sum(), 1)),
+        "pairs": int(wanted.sum()),
+        **_detours(route[joined] / by.direct[possible][joined]),
     }
 
 

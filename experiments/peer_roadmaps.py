@@ -40,7 +40,7 @@ def wave_fronts(cells: np.ndarray, apart: float) -> np.ndarray:
     meets = np.zeros(away.shape, bool)
     for low, high in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
         gap = np.hypot(*(source[:, *low] - source[:, *high]))
-        front = gap > np.maximum(apart, np.maximum(away[low], away[high]))
+        front = gap > apart
         farther = away[low] >= away[high]
         meets[low] |= front & farther
         meets[high] |= front & ~farther
@@ -61,9 +61,7 @@ def of_thin_graph(ground: Ground, cells: np.ndarray) -> Roadmap:
         ends.append((names[a], names[b]))
         lines.append(ground.points(np.vstack([first, inner, last])))
     is_open = np.zeros(len(centre), bool)
-    return Roadmap(
-        ground.points(centre), np.array(ends, int).reshape(-1, 2), tuple(lines), is_open
-    )
+    return Roadmap(ground.points(centre), np.array(ends, int).reshape(-1, 2), tuple(lines), is_open)
 
 
 def thinned(ground: Ground, robot_radius: float) -> Roadmap:

@@ -45,6 +45,9 @@ class Rules(NamedTuple):
     dead_end_angle: float = DEAD_END_ANGLE
 
 
+RULES = Rules()
+
+
 class Branches(NamedTuple):
     """Ridges of a Voronoi diagram.
 
@@ -101,7 +104,7 @@ def branches(walls: np.ndarray) -> Branches:
     return Branches(xy, cKDTree(samples).query(xy)[0], pairs[real], apart[real])
 
 
-def plan_graph(found: Branches, start: np.ndarray, rules: Rules = Rules()) -> PlanGraph:
+def plan_graph(found: Branches, start: np.ndarray, rules: Rules = RULES) -> PlanGraph:
     """The graph of the branches that a robot reaches from `start` (2,) [m]."""
     fits = found.clearance >= rules.robot_radius
     kept = fits[found.edges].all(axis=1)

@@ -38,7 +38,9 @@ def choose_places(
     """Random places among candidates (C, 2) [m], and pairs of them from `STARTS` of them."""
     chosen = rng.choice(len(candidates), min(num_places, len(candidates)), replace=False)
     starts = rng.integers(min(STARTS, len(chosen)), size=num_pairs)
-    return Places(candidates[chosen], np.column_stack([starts, rng.integers(len(chosen), size=num_pairs)]))
+    return Places(
+        candidates[chosen], np.column_stack([starts, rng.integers(len(chosen), size=num_pairs)])
+    )
 
 
 def free_places(rng: np.random.Generator, ground: Ground, num_pairs: int) -> Places:

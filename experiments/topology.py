@@ -19,8 +19,16 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from experiments import common, halls, log_folder, peer_roadmaps, plan_drives, plan_graph
-from experiments import route_measures, waypoint_measures
+from experiments import (
+    common,
+    halls,
+    log_folder,
+    peer_roadmaps,
+    plan_drives,
+    plan_graph,
+    route_measures,
+    waypoint_measures,
+)
 from experiments.common import Numbers
 from experiments.ground_truth import without_padding
 from experiments.plan_agreement import agreement, branches_of

@@ -19,6 +19,7 @@ COLOURS = {
     "thinning": common.GREEN,
     "brushfire": common.PINK,
 }
+ALL = 0.995  # share of the pairs that are joined, below which it is written
 KINDS = {"log": "", "hall": "hall: ", "map": "map: "}
 
 
@@ -69,7 +70,7 @@ def _draw_graph(axis, drawn: Numbers) -> None:
 
 
 def _draw_detours(axis, rows: list[Numbers]) -> None:
-    """Bars of the median detour, and lines to that of nine routes of ten."""
+    """Bars of the median detour, lines to that of nine routes of ten, and the share joined."""
     groups: dict[str, list[Numbers]] = {}
     for row in rows:
         groups.setdefault(KINDS[row["kind"]] + row["name"], []).append(row)
@@ -82,13 +83,19 @@ def _draw_detours(axis, rows: list[Numbers]) -> None:
                 colour = COLOURS[row["method"]]
                 axis.barh(y, row["detour_median"] - 1.0, left=1.0, height=0.85, color=colour)
                 axis.plot([row["detour_median"], row["detour_p90"]], [y, y], color="0.3", lw=1.0)
+                if row["routed"] < ALL:
+                    text = f" {row['routed']:.0%}"
+                    axis.text(row["detour_p90"], y, text, va="center", fontsize=7)
             y += 1.0
         ticks.append((first + y - 1.0) / 2)
         y += 0.8
     for name in methods:
         axis.barh(0.0, 0.0, color=COLOURS[name], label=name)
     axis.set_yticks(ticks, list(groups))
-    axis.set(title="route by shortest path", xlabel="median, and 90 % of the routes")
+    axis.set(
+        title="length of route / shortest path",
+        xlabel="median (bar), 90 % of routes (line), share routed",
+    )
     axis.set_xlim(left=1.0)
     axis.invert_yaxis()
     axis.legend(frameon=False, fontsize=8)

@@ -104,8 +104,8 @@ def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) 
                 | d2
         ####### f2 ################
 
-    Of the two cells the one farther from its obstacle is marked. Each obstacle is known to a cell or
-    so: few marks beside each other, near to walls, are a corner, and are dropped.
+    Of the two cells the one farther from its obstacle is marked. Each obstacle is known to a cell
+    or so: few marks beside each other, near to walls, are a corner, and are dropped.
 
     Args:
         space: Free configurations.

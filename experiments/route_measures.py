@@ -138,7 +138,7 @@ def _routes(by: Judge, chains: Chains, matrix: sparse.csr_array, largest: np.nda
     entry_at = np.full(by.grid.shape[0], -1)
     entry_at[sources] = largest[first]
     reached = np.isfinite(to_graph[by.places])
-    entry = np.where(reached, entry_at[source[by.places]], -1)
+    entry = np.where(reached, entry_at[np.maximum(source[by.places], 0)], -1)
     to_graph_of = to_graph[by.places]
     region = csgraph.connected_components(by.grid, directed=False)[1]
     wanted = np.isfinite(by.direct) & (by.direct >= MIN_APART)

@@ -200,6 +200,21 @@ def test_a_plain_room_is_one_node_or_one_arc():
     assert len(long.id) == 2 and len(long.arc_ends) == 1
 
 
+@pytest.mark.parametrize("turn", np.linspace(0.05, 0.8, 8))
+def test_dead_ends_of_a_turned_room_do_not_run_into_its_corners(turn):
+    # 9 m by 2.4 m: the medial axis ends 1.2 m from both short walls.
+    cell, half = 0.05, np.array([4.5, 1.2])
+    centres = (np.stack(np.indices((220, 220)), axis=-1) + 0.5) * cell - 5.5
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    free = (np.abs(centres @ rotation) < half).all(axis=-1)
+    origin = np.array([-5.5, -5.5, 0.0])
+    graph = topology_of(free, resolution=cell, origin=origin, robot_radius=0.2).graph
+    assert sorted(degrees(graph)) == [1, 1]
+    ends = graph.xy @ rotation
+    ends = ends[np.argsort(ends[:, 0])]
+    np.testing.assert_allclose(ends, [[-3.3, 0.0], [3.3, 0.0]], atol=0.2)
+
+
 def test_the_graph_is_in_the_frame_of_the_map():
     free, origin = clutter(0), np.array([-3.0, 7.0, 2.1])
     here, there = topology_of(free).graph, topology_of(free, origin=origin).graph

@@ -17,7 +17,7 @@ from experiments.plan_graph import PlanGraph
 from experiments.roadmaps import Chains, Ground, Roadmap, grid_graph
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.types import JUNCTION
-from jaxslam.simulation.worlds import outline
+from jaxslam.simulation.worlds import outline, polyline
 
 RADIUS = 0.2
 
@@ -79,6 +79,14 @@ def test_detour_of_a_corner_is_that_of_two_sides():
         route_measures.judge(ground, ends), roadmap(ground, cells, [(0, 1), (1, 2)])
     )
     assert own["detour_median"] == pytest.approx(np.sqrt(2.0), rel=1e-3)
+
+
+def test_routes_count_the_free_path_to_the_graph_and_from_it():
+    ground = Ground.of_map(two_rooms(), RADIUS)
+    beside = ground.points(np.array([(8, 30), (44, 30)]))
+    by = route_measures.judge(ground, route_measures.Places(beside, np.array([[0, 1]])))
+    own = route_measures.measure(by, roadmap(ground, [(4, 20), (90, 20)], [(0, 1)]))
+    assert own["detour_median"] == pytest.approx((1.0 + 3.6 + 1.0) / 3.6, rel=0.03)
 
 
 def test_blocked_parts_and_lonely_nodes_are_counted():
@@ -147,6 +155,15 @@ def test_graph_of_a_plan_has_its_junctions_and_dead_ends():
     for xy in expected:
         assert np.hypot(*(ends - xy).T).min() < 0.02
     np.testing.assert_allclose(sorted(found.clearance[degree == 1]), [1, 1, 1, 2], atol=0.02)
+
+
+def test_a_dead_end_of_a_plan_does_not_run_into_a_wedge():
+    tip = 8.0 + 1.0 / np.tan(np.radians(32.5))
+    walls = polyline([(0.0, 0.0), (8.0, 0.0), (tip, 1.0), (8.0, 2.0), (0.0, 2.0), (0.0, 0.0)])
+    found = plan_graph.plan_graph(plan_graph.branches(walls), np.array([4.0, 1.0]))
+    ends = found.xy[np.argsort(found.xy[:, 0])]
+    last = 8.0 - np.tan(np.radians(32.5 / 2))
+    np.testing.assert_allclose(ends, [[1.0, 1.0], [last, 1.0]], atol=0.05)
 
 
 def test_a_plan_agrees_with_itself_and_not_with_less():

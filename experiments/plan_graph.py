@@ -37,15 +37,36 @@ class Rules(NamedTuple):
         spur: Factor of the lengths up to which spurs are dropped.
         merge: Factor of the distances up to which junctions are one.
         dead_end_angle: [rad] under which the walls beside a dead end are seen, at least.
+        shortest: [m] Spurs up to this length are dropped before all others.
     """
 
     robot_radius: float = 0.2
     spur: float = 1.0
     merge: float = 1.0
     dead_end_angle: float = DEAD_END_ANGLE
+    shortest: float = 0.0
 
 
 RULES = Rules()
+TOLERANCE = 0.15  # by which lengths may differ from those of the rules
+ANGLE_TOLERANCE = np.radians(5.0)
+SHORTEST = 0.1  # [m] of a spur that a map shows: two cells
+
+
+def variants() -> list[Rules]:
+    """The rules, first, and such as differ by no more than the tolerances.
+
+    Where these make other nodes, cells of 5 cm cannot decide, and either is right.
+    """
+    factors = 1.0, 1.0 - TOLERANCE, 1.0 + TOLERANCE
+    turns = 0.0, -ANGLE_TOLERANCE, ANGLE_TOLERANCE
+    return [
+        Rules(spur=spur, merge=merge, dead_end_angle=DEAD_END_ANGLE + turn, shortest=shortest)
+        for spur in factors
+        for merge in factors
+        for turn in turns
+        for shortest in (0.0, SHORTEST)
+    ]
 
 
 class Branches(NamedTuple):
@@ -197,6 +218,8 @@ def _clean_up(arcs: list[PlanArc], found: Branches, rules: Rules) -> dict[int, l
         The junctions that became one with each other one.
     """
     before, stands_for = -1, defaultdict(list)
+    _drop_shortest(arcs, found, rules.shortest)
+    _join(arcs)
     while before != len(arcs):
         before = len(arcs)
         while _drop_spurs(arcs, found, rules):
@@ -204,6 +227,15 @@ def _clean_up(arcs: list[PlanArc], found: Branches, rules: Rules) -> dict[int, l
         _join(arcs)
         _merge(arcs, found, rules, stands_for)
     return stands_for
+
+
+def _drop_shortest(arcs: list[PlanArc], found: Branches, shortest: float) -> None:
+    """Drop spurs no longer than `shortest` [m], at junctions; in place."""
+    at = _at_nodes(arcs)
+    for arc in list(arcs):
+        degree = sorted(len(at[node]) for node in arc.ends)
+        if degree[0] == 1 < degree[1] and _length(found.xy, arc.path) <= shortest:
+            arcs.remove(arc)
 
 
 def _drop_spurs(arcs: list[PlanArc], found: Branches, rules: Rules) -> bool:

@@ -17,7 +17,7 @@ _ROUND = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 _EIGHT = np.ones((3, 3), bool)
 
-COARSE_DISTANCE = 10.0
+COARSE_DISTANCE = 11.0
 """[cells] Nearer to a right corner its two walls may appear under 120 degrees, in cells."""
 
 MIN_RUN = 4

@@ -249,10 +249,20 @@ def test_rows_and_picture_of_a_subject(tmp_path):
 
 
 def test_totals_of_plans_are_shares():
-    row = {"plan": 0, "true_nodes": 4, "nodes": 5, "nodes_found": 4, "true_arcs": 4, "arcs": 4}
-    row |= {"scans": 9, "arcs_found": 3, "node_errors_m": np.array([0.1, 0.0, 0.1, 0.1])}
-    total = topology.plan_totals([row, row])
+    score = {"true_nodes": 4, "nodes": 5, "nodes_found": 4, "true_arcs": 4, "arcs": 4}
+    score |= {"arcs_found": 3, "node_errors_m": np.array([0.1, 0.0, 0.1, 0.1])}
+    total = topology.totals_of([score, score])
     assert total["nodes_found"] == 1.0
     assert total["nodes_spurious"] == pytest.approx(0.2)
     assert total["arcs_found"] == 0.75
-    assert topology.plan_totals([]) == {}
+    assert topology.errors_of(score) == 3
+    assert topology.totals_of([]) == {}
+
+
+def test_a_spur_at_the_limit_is_in_some_variants_of_a_plan_alone():
+    # A dead end of 1.25 m, whose junction is as far from the walls.
+    walls = outline([(0.0, 0.0, 12.0, 2.0), (5.0, 2.0, 7.0, 3.5)])
+    ridges, start = plan_graph.branches(walls), np.array([1.0, 1.0])
+    sizes = [len(plan_graph.plan_graph(ridges, start, rules).xy) for rules in plan_graph.variants()]
+    assert min(sizes) == 2
+    assert max(sizes) == 4

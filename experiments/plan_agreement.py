@@ -31,7 +31,7 @@ class Agreement(NamedTuple):
 def branches_of(graph: TopologicalMap, frame: np.ndarray) -> PlanGraph:
     """The branches of a map in another frame, without arcs through open space.
 
-    Nodes that only split a branch are passed through; those without a branch are left out.
+    The nodes that only split a branch are passed through; those without a branch are left out.
 
     Args:
         graph: The map.
@@ -66,7 +66,7 @@ def branches_of(graph: TopologicalMap, frame: np.ndarray) -> PlanGraph:
 
 
 def agreement(true: PlanGraph, found: PlanGraph) -> Agreement:
-    """Nodes that lie within `NEAR` of each other, and arcs between these that lie beside.
+    """The nodes that lie within `NEAR` of each other, and arcs between these that lie beside.
 
     A true node that stands for several junctions is where any of them is.
     """

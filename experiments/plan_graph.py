@@ -93,7 +93,7 @@ class PlanArc(NamedTuple):
 
 
 class PlanGraph(NamedTuple):
-    """Nodes and arcs of a floor plan.
+    """The nodes and arcs of a floor plan.
 
     Attributes:
         xy: (N, 2) [m] junctions and dead ends.

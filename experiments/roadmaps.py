@@ -1,4 +1,4 @@
-"""Graphs for going places, whoever made them, and the free space that they are judged by."""
+"""Graphs for going places, whoever made them, and the free space in which they are measured."""
 
 from typing import NamedTuple
 

@@ -1,6 +1,6 @@
 """How good a graph is for going places: is it whole, free, near, and how far does it lead around.
 
-The judge is the occupancy map. Between two places the graph route leads through free space to the
+The occupancy map decides. Between two places the graph route leads through free space to the
 nearest point of the graph, along it, and through free space to the goal; its length is compared
 with that of the shortest path over the free cells.
 """
@@ -51,7 +51,7 @@ def free_places(rng: np.random.Generator, ground: Ground, num_pairs: int) -> Pla
     return choose_places(rng, ground.points(np.argwhere(region == size.argmax())), num_pairs)
 
 
-class Judge(NamedTuple):
+class ShortestPaths(NamedTuple):
     """The shortest paths over the free cells, with which routes over a graph are compared.
 
     Attributes:
@@ -77,12 +77,12 @@ class Judge(NamedTuple):
         return self.number[tuple(self.nearest[:, *self.ground.cells(points)[0].T])]
 
 
-def judge(ground: Ground, places: Places) -> Judge:
-    """The judge of routes between some places."""
+def shortest_paths(ground: Ground, places: Places) -> ShortestPaths:
+    """The shortest paths between some places."""
     number, grid = grid_graph(ground.fits, ground.resolution)
     nearest = ndimage.distance_transform_edt(~ground.fits, return_indices=True)[1]
     pairs = places.pairs[np.argsort(places.pairs[:, 0], kind="stable")]
-    new = Judge(ground, number, grid, nearest, np.zeros(0, int), pairs, np.zeros(0))
+    new = ShortestPaths(ground, number, grid, nearest, np.zeros(0, int), pairs, np.zeros(0))
     at, direct = new.cells(places.xy), []
     for start in np.unique(pairs[:, 0]).tolist():
         away = csgraph.dijkstra(grid, directed=False, indices=at[start])
@@ -90,7 +90,7 @@ def judge(ground: Ground, places: Places) -> Judge:
     return new._replace(places=at, direct=np.concatenate(direct))
 
 
-def measure(by: Judge, roadmap: Roadmap) -> Numbers:
+def measure(by: ShortestPaths, roadmap: Roadmap) -> Numbers:
     """Structure of a graph, how much of its arcs is blocked, and routes between places.
 
     Returns:
@@ -124,7 +124,9 @@ def measure(by: Judge, roadmap: Roadmap) -> Numbers:
     return structure | _routes(by, chains, matrix, np.flatnonzero(part == sizes.argmax()))
 
 
-def _routes(by: Judge, chains: Chains, matrix: sparse.csr_array, largest: np.ndarray) -> Numbers:
+def _routes(
+    by: ShortestPaths, chains: Chains, matrix: sparse.csr_array, largest: np.ndarray
+) -> Numbers:
     """The numbers of `measure` that need paths; `largest` holds the points of the largest part."""
     sources, first = np.unique(by.cells(chains.xy[largest]), return_index=True)
     to_graph, _, source = csgraph.dijkstra(

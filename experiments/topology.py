@@ -56,7 +56,7 @@ class Subject(NamedTuple):
     Attributes:
         kind: "log", "map" or "hall".
         name: Of the log, map or building.
-        occupancy: The map by which graphs are judged.
+        occupancy: The map by which graphs are measured.
         poses: (T, 2) [m] where the robot was; None if there was none.
         roadmaps: Graphs by method.
     """
@@ -121,7 +121,7 @@ def rows_of(subject: Subject, seed: int, num_routes: int) -> list[Numbers]:
         places = route_measures.free_places(rng, ground, num_routes)
     else:
         places = route_measures.choose_places(rng, subject.poses, num_routes)
-    by = route_measures.judge(ground, places)
+    by = route_measures.shortest_paths(ground, places)
     roadmaps = dict(subject.roadmaps)
     for name, peer in peer_roadmaps.available().items():
         roadmaps[name] = peer(ground, ROBOT_RADIUS)

@@ -94,7 +94,7 @@ def _draw_detours(axis, rows: list[Numbers]) -> None:
     axis.set_yticks(ticks, list(groups))
     axis.set(
         title="length of route / shortest path",
-        xlabel="median (bar), 90 % of routes (line), share routed",
+        xlabel="median (bar), 90 % of routes (line)",
     )
     axis.set_xlim(left=1.0)
     axis.invert_yaxis()

@@ -45,7 +45,7 @@ def places(ground: Ground, count: int = 200) -> route_measures.Places:
 
 
 def measured(ground: Ground, graph: Roadmap) -> dict:
-    return route_measures.measure(route_measures.judge(ground, places(ground)), graph)
+    return route_measures.measure(route_measures.shortest_paths(ground, places(ground)), graph)
 
 
 def test_points_and_cells_of_a_turned_grid_are_inverse():
@@ -76,7 +76,7 @@ def test_detour_of_a_corner_is_that_of_two_sides():
     cells = [(6, 6), (6, 97), (97, 97)]
     ends = route_measures.Places(ground.points(np.array(cells)), np.array([[0, 2]]))
     own = route_measures.measure(
-        route_measures.judge(ground, ends), roadmap(ground, cells, [(0, 1), (1, 2)])
+        route_measures.shortest_paths(ground, ends), roadmap(ground, cells, [(0, 1), (1, 2)])
     )
     assert own["detour_median"] == pytest.approx(np.sqrt(2.0), rel=1e-3)
 
@@ -84,7 +84,7 @@ def test_detour_of_a_corner_is_that_of_two_sides():
 def test_routes_count_the_free_path_to_the_graph_and_from_it():
     ground = Ground.of_map(two_rooms(), RADIUS)
     beside = ground.points(np.array([(8, 30), (44, 30)]))
-    by = route_measures.judge(ground, route_measures.Places(beside, np.array([[0, 1]])))
+    by = route_measures.shortest_paths(ground, route_measures.Places(beside, np.array([[0, 1]])))
     own = route_measures.measure(by, roadmap(ground, [(4, 20), (90, 20)], [(0, 1)]))
     assert own["detour_median"] == pytest.approx((1.0 + 3.6 + 1.0) / 3.6, rel=0.03)
 

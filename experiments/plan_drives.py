@@ -21,7 +21,7 @@ from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
 CELL = 0.15  # [m] of the grid on which paths are found
-CLEARANCE = 0.35  # [m] of the robot's centre from the walls
+CLEARANCE = 0.3  # [m] of the robot's centre from the walls
 LIDAR = Lidar(num_beams=541, angle_min=-0.75 * np.pi, angle_increment=np.pi / 360, range_max=30.0)
 _WIDTH = 5  # points over which a path is smoothed
 

@@ -82,6 +82,11 @@ def free_configurations(
     fits = to_edge >= clearance
     if also_free is not None:
         fits |= also_free
+        # Where it drove nearer to a wall, free cells between make no ring.
+        hole, count = ndimage.label(np.pad(~fits, 1, constant_values=True))
+        has_wall = np.zeros(count + 1, bool)
+        has_wall[hole[np.pad(~free, 1, constant_values=True)]] = True
+        fits |= ~has_wall[hole[1:-1, 1:-1]] & ~fits
     region, count = ndimage.label(fits, structure=_EIGHT)
     sizes = np.bincount(region.ravel(), minlength=count + 1)[1:]
     order = np.argsort(-sizes, kind="stable")

@@ -358,3 +358,16 @@ def test_a_spur_into_a_corner_is_dropped(tip, arcs):
     dropped = cell_graph_cleanup.drop_spurs(net, clearance)
     assert dropped == (arcs == 2)  # 40 long, from a clearance of 30
     assert len(net.arcs) == arcs
+
+
+def test_a_drive_near_a_wall_makes_no_ring():
+    free = carved((60, 40), (5, 55, 5, 35))
+    driven = np.zeros_like(free)
+    driven[20:40, 6] = True
+    driven[20, 6:12] = driven[39, 6:12] = True
+    space = medial_axis.free_configurations(free, clearance=4.0, also_free=driven)
+    assert holes(space.region > 0) == 0
+    driven[30, 20:30] = True
+    free[25:28, 15:18] = False
+    space = medial_axis.free_configurations(free, clearance=2.0, also_free=driven & free)
+    assert holes(space.region > 0) == 1

@@ -2,6 +2,7 @@
 
 from functools import partial
 from importlib import import_module
+from typing import Any
 
 import jax
 import numpy as np
@@ -61,10 +62,10 @@ def distance_to_blocked(free: np.ndarray) -> np.ndarray:
     return ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] - 0.5
 
 
-def junctions(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Junctions (K, 2) [cells] of three or more branches in free cells (H, W), and their clearance.
+def pruned_graph(free: np.ndarray) -> tuple[Any, dict[int, float]]:
+    """Graph of the thinned free cells (H, W), as sknw makes it, and the clearance [cells] of nodes.
 
-    Dead ends no longer than the clearance (K,) [cells] at their junction are pruned.
+    Dead ends no longer than the clearance at their junction are pruned.
     """
     skeletonize, build = (import_module(name) for name in NEEDS)
     distance = distance_to_blocked(free)
@@ -72,8 +73,10 @@ def junctions(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     while True:
         graph = build.build_sknw(thin.astype(np.uint16), multi=True, full=False)
         degree = dict(graph.degree())
-        centre = {n: np.asarray(own["o"], float) for n, own in graph.nodes(data=True)}
-        clearance = {n: distance[tuple(np.round(xy).astype(int))] for n, xy in centre.items()}
+        clearance = {
+            n: float(distance[tuple(np.round(own["o"]).astype(int))])
+            for n, own in graph.nodes(data=True)
+        }
         pruned = thin.copy()
         for one, other, arc in graph.edges(data=True):
             tip, root = sorted((one, other), key=degree.get)
@@ -81,10 +84,18 @@ def junctions(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 pruned[tuple(arc["pts"].T)] = False
                 pruned[tuple(graph.nodes[root]["pts"].T)] = True
         if np.array_equal(pruned, thin):
-            break
+            return graph, clearance
         thin = skeletonize.skeletonize(pruned)
-    kept = [n for n in centre if degree[n] > 2]
-    xy = np.array([centre[n] for n in kept]).reshape(-1, 2)
+
+
+def junctions(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Junctions (K, 2) [cells] of three or more branches in free cells (H, W), and their clearance.
+
+    Dead ends no longer than the clearance (K,) [cells] at their junction are pruned.
+    """
+    graph, clearance = pruned_graph(free)
+    kept = [n for n, degree in graph.degree() if degree > 2]
+    xy = np.array([graph.nodes[n]["o"] for n in kept], float).reshape(-1, 2)
     return xy, np.array([clearance[n] for n in kept])
 
 

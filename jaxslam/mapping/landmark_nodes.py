@@ -10,8 +10,15 @@ from jaxslam.core.maps import TopologicalMap
 from jaxslam.mapping.open_space import FreeSpace
 from jaxslam.mapping.plane_graph import Line, PlaneGraph
 
+SAME_PLACE = 0.2
+"""[m] or half of the clearance, if that is less, within which node and landmark are the same.
+
+The nodes of a diagram are good to two cells; what is farther off is another junction, perhaps of a
+branch into a corner, which the diagram does not have.
+"""
+
 SAME_NODE = 0.5
-"""[m] or half of the clearance, if that is less, within which node and landmark are the same."""
+"""[m] within which nodes of two maps are the same."""
 
 CONTRADICTED = 0.5
 """A landmark with less than this share of its clearance left has an obstacle in its circle."""
@@ -47,7 +54,7 @@ def place_landmarks(
     names: dict[int, int] = {}
     left = space.at(xy) if len(xy) else np.zeros(0)
     usable = np.flatnonzero((left > 0.0) & (left >= CONTRADICTED * clearance))
-    radius = np.minimum(SAME_NODE, 0.5 * clearance)
+    radius = np.minimum(SAME_PLACE, 0.5 * clearance)
     ends = np.union1d(np.flatnonzero(graph.degrees() != 2), list(junctions or ())).astype(int)
     pairs = []
     if len(ends) and len(usable):

@@ -17,6 +17,12 @@ _ROUND = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 _EIGHT = np.ones((3, 3), bool)
 
+COARSE_DISTANCE = 11.0
+"""[cells] Nearer to a right corner its two walls may appear under 120 degrees, in cells."""
+
+MIN_RUN = 4
+"""[cells] Nearer to walls than that, fewer anchors beside each other are no dead end."""
+
 
 class FreeConfigurations(NamedTuple):
     """Free configurations of a disc-shaped robot, H x W cells.
@@ -76,6 +82,11 @@ def free_configurations(
     fits = to_edge >= clearance
     if also_free is not None:
         fits |= also_free
+        # Where it drove nearer to a wall, free cells between make no ring.
+        hole, count = ndimage.label(np.pad(~fits, 1, constant_values=True))
+        has_wall = np.zeros(count + 1, bool)
+        has_wall[hole[np.pad(~free, 1, constant_values=True)]] = True
+        fits |= ~has_wall[hole[1:-1, 1:-1]] & ~fits
     region, count = ndimage.label(fits, structure=_EIGHT)
     sizes = np.bincount(region.ravel(), minlength=count + 1)[1:]
     order = np.argsort(-sizes, kind="stable")
@@ -98,7 +109,8 @@ def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) 
                 | d2
         ####### f2 ################
 
-    Of the two cells the one farther from its obstacle is marked.
+    Of the two cells the one farther from its obstacle is marked. Each obstacle is known to a cell
+    or so: few marks beside each other, near to walls, are a corner, and are dropped.
 
     Args:
         space: Free configurations.
@@ -122,7 +134,22 @@ def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) 
         high_is_farther = distance[high] > distance[low]
         anchors[low] |= between & ~high_is_farther
         anchors[high] |= between & high_is_farther
-    return anchors
+    return anchors & ~_few(anchors, space.distance)
+
+
+def _few(anchors: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Anchors (H, W) near to walls with few others beside them.
+
+    Args:
+        anchors: (H, W) bool.
+        distance: (H, W) [cells] to the nearest obstacle.
+    """
+    group, _ = ndimage.label(ndimage.binary_dilation(anchors, _EIGHT), structure=_EIGHT)
+    group = np.where(anchors, group, 0)
+    count = np.bincount(group.ravel())
+    farthest = np.zeros(len(count))
+    np.maximum.at(farthest, group.ravel(), distance.ravel())
+    return anchors & ((count < MIN_RUN) & (farthest < COARSE_DISTANCE))[group]
 
 
 def medial_cells(space: FreeConfigurations, regions: np.ndarray, kept: np.ndarray) -> np.ndarray:

@@ -200,6 +200,21 @@ def test_a_plain_room_is_one_node_or_one_arc():
     assert len(long.id) == 2 and len(long.arc_ends) == 1
 
 
+@pytest.mark.parametrize("turn", np.linspace(0.05, 0.8, 8))
+def test_dead_ends_of_a_turned_room_do_not_run_into_its_corners(turn):
+    # 9 m by 2.4 m: the medial axis ends 1.2 m from both short walls.
+    cell, half = 0.05, np.array([4.5, 1.2])
+    centres = (np.stack(np.indices((220, 220)), axis=-1) + 0.5) * cell - 5.5
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    free = (np.abs(centres @ rotation) < half).all(axis=-1)
+    origin = np.array([-5.5, -5.5, 0.0])
+    graph = topology_of(free, resolution=cell, origin=origin, robot_radius=0.2).graph
+    assert sorted(degrees(graph)) == [1, 1]
+    ends = graph.xy @ rotation
+    ends = ends[np.argsort(ends[:, 0])]
+    np.testing.assert_allclose(ends, [[-3.3, 0.0], [3.3, 0.0]], atol=0.2)
+
+
 def test_the_graph_is_in_the_frame_of_the_map():
     free, origin = clutter(0), np.array([-3.0, 7.0, 2.1])
     here, there = topology_of(free).graph, topology_of(free, origin=origin).graph
@@ -343,3 +358,16 @@ def test_a_spur_into_a_corner_is_dropped(tip, arcs):
     dropped = cell_graph_cleanup.drop_spurs(net, clearance)
     assert dropped == (arcs == 2)  # 40 long, from a clearance of 30
     assert len(net.arcs) == arcs
+
+
+def test_a_drive_near_a_wall_makes_no_ring():
+    free = carved((60, 40), (5, 55, 5, 35))
+    driven = np.zeros_like(free)
+    driven[20:40, 6] = True
+    driven[20, 6:12] = driven[39, 6:12] = True
+    space = medial_axis.free_configurations(free, clearance=4.0, also_free=driven)
+    assert holes(space.region > 0) == 0
+    driven[30, 20:30] = True
+    free[25:28, 15:18] = False
+    space = medial_axis.free_configurations(free, clearance=2.0, also_free=driven & free)
+    assert holes(space.region > 0) == 1

@@ -13,6 +13,7 @@ from experiments import ground_truth
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.evaluation.trajectory import align_trajectory
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.mapping.config import MappingSpec
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.offline import run_slam
 from jaxslam.pipeline.results import SlamResult
@@ -125,7 +126,7 @@ def mapped(log: PlanLog) -> tuple[Config, SlamResult]:
 
     The topological map is the merged one; `mapping_stage.with_maps` makes that of the grid of it.
     """
-    config = Config.for_laser_log(LIDAR)._replace(topology="merged")
+    config = Config.for_laser_log(LIDAR)._replace(mapping=MappingSpec("merged"))
     params = NoiseParams.for_laser_log(match_scans=True)
     return config, run_slam(config, params, log.odometry, log.scans, start=log.truth[0])
 

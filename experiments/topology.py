@@ -1,7 +1,7 @@
 """How good topological maps are for going places, and how true, beside other graphs.
 
 graphs of logs in --data, of map_server maps in --maps, and of simulated buildings with wide halls:
-    grid, merged       what `jaxslam run` makes, with `Config.topology` of either name
+    grid, merged       what `jaxslam run` makes, with `MappingSpec.topology` of either name
     map                what `jaxslam map` makes of the occupancy map
     thinning, brushfire  peers, of the same occupancy map (`peer_roadmaps`)
 each measured by routes between random places (`route_measures`) and as SWAGGER evaluates its graphs
@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from experiments import (
     common,
-    halls,
+    hall_plans,
     log_folder,
     peer_roadmaps,
     plan_drives,
@@ -39,6 +39,7 @@ from jaxslam.core.caches import enable_caches
 from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.scan import Scan
 from jaxslam.io import ros_map
+from jaxslam.mapping.config import MappingSpec
 from jaxslam.mapping.grid_topology import extract_topology
 from jaxslam.pipeline import log_input, mapping_stage
 from jaxslam.pipeline.config import Config
@@ -47,6 +48,7 @@ from jaxslam.simulation import floor_plans
 
 NAME = "topology"
 ROBOT_RADIUS = 0.2  # [m]
+GRID, MERGED = MappingSpec("grid", ROBOT_RADIUS), MappingSpec("merged")
 HALL_SPACING, PLAN_SPACING = 4.0, 1.5  # [m] between the places that a drive visits
 
 
@@ -70,7 +72,7 @@ class Subject(NamedTuple):
 
 def of_run(kind: str, name: str, config: Config, scans: Scan, merged: SlamResult) -> Subject:
     """Both graphs of a run whose topological map is the merged one."""
-    grid = mapping_stage.with_maps(config._replace(topology="grid"), scans, merged, None)
+    grid = mapping_stage.with_maps(config._replace(mapping=GRID), scans, merged, None)
     poses = grid.poses[np.isfinite(grid.poses[:, 0]), :2]
     own = {"grid": grid.topological_map, "merged": merged.topological_map}
     roadmaps = {method: Roadmap.of_map(graph) for method, graph in own.items()}
@@ -83,7 +85,7 @@ def of_logs(folder: Path | None) -> Iterator[Subject]:
     logs = log_folder.find_logs(folder, installed=False) if folder else []
     for name, log in zip(log_folder.unique_names(logs), logs, strict=True):
         given = log_input.from_laser_log(log.laser_log)
-        given = given._replace(config=given.config._replace(topology="merged"))
+        given = given._replace(config=given.config._replace(mapping=MERGED))
         yield of_run("log", name, given.config, given.scans, log_input.run(given))
 
 
@@ -103,7 +105,7 @@ def of_maps(folder: Path | None) -> Iterator[Subject]:
 
 def of_halls(seed: int) -> Iterator[Subject]:
     """Buildings with wide halls, driven through."""
-    for name, walls in halls.BUILDINGS.items():
+    for name, walls in hall_plans.BUILDINGS.items():
         log = plan_drives.drive(seed, walls(), spacing=HALL_SPACING)
         yield of_run("hall", name, *_mapped(log))
 
@@ -144,7 +146,7 @@ def plan_row(number: int) -> Numbers:
     walls = without_padding(np.asarray(floor_plans.floor_plan(jax.random.key(number)).walls))
     log = plan_drives.drive(number, walls, spacing=PLAN_SPACING)
     config, merged = plan_drives.mapped(log)
-    mapped = mapping_stage.with_maps(config._replace(topology="grid"), log.scans, merged, None)
+    mapped = mapping_stage.with_maps(config._replace(mapping=GRID), log.scans, merged, None)
     found = branches_of(mapped.topological_map, plan_drives.to_world(log, mapped))
     ridges = plan_graph.branches(walls)
     scores = [

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from experiments import (
-    halls,
+    hall_plans,
     peer_roadmaps,
     plan_drives,
     plan_graph,
@@ -208,7 +208,7 @@ def test_a_tour_comes_near_all_places_and_keeps_off_walls():
 
 
 def test_halls_are_as_wide_as_they_say():
-    for build in halls.BUILDINGS.values():
+    for build in hall_plans.BUILDINGS.values():
         walls = build()
         assert np.isfinite(walls).all()
         free = plan_graph.ground_truth.FreeSpace(walls)

@@ -248,7 +248,8 @@ def decode(labels: Array, encoded: EncodedDiagram, *, octagon: bool = False) -> 
     cells = jnp.pad(encoded.cells, 1, constant_values=FROZEN)
     waited, arrival = jnp.pad(encoded.arrival, 1), encoded.arrival
     one, none = jnp.ones((), labels.dtype), jnp.zeros((), labels.dtype)
-    bits = jnp.where(cells >= 0, one << jnp.maximum(cells, 0).astype(labels.dtype), none)
+    wrap = jnp.int8(8 * labels.dtype.itemsize - 1)  # numbers past the last bit start again
+    bits = jnp.where(cells >= 0, one << (jnp.maximum(cells, 0) & wrap).astype(labels.dtype), none)
 
     def arrived(beside: Callable[[Array], tuple[Array, Array, Array, Array]]) -> Array:
         pairs = zip(beside(bits), beside(waited), strict=True)

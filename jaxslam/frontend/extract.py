@@ -16,7 +16,7 @@ from jaxslam.frontend.features import find_corners, find_wall_directions
 from jaxslam.frontend.grid import rasterise, seen_free
 from jaxslam.frontend.lidar import begin_behind
 from jaxslam.frontend.local_graph import LocalArcs
-from jaxslam.frontend.segments import segment_cells
+from jaxslam.frontend.segments import segment_bits, segment_cells
 
 SCAN_BATCH = 16  # scans whose features are extracted together
 
@@ -80,8 +80,7 @@ def extract_diagram(config: FrontendConfig, scan: Scan) -> tuple[Features, Diagr
     else:
         segment = segment_cells(lidar, spec, scan, segments)
         sources = segment >= 0
-        bit = jnp.uint32(1) << jnp.maximum(segment, 0).astype(jnp.uint32)
-        labels = jnp.where(sources, bit, 0)
+        labels = segment_bits(segment)
         start = encode_segments(segment, seen_free(lidar, spec, scan))
     octagon = config.labels == "segments"
     encoded = automaton.expand_encoded(start, steps=config.automaton_steps, octagon=octagon)

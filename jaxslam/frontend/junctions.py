@@ -33,6 +33,21 @@ from jaxslam.frontend.tangent_circles import (
 BLOCK = 3
 """Side [cells] of the square blocks of the grid, each of which starts one circle at most."""
 
+CELLS_PER_START = 3
+"""Junction cells that are looked at for each circle that may start: most are of one junction."""
+
+MAX_STEP, MAX_TRUSTED_STEP = 0.08, 0.05
+"""[m] Beam ends of rough walls may be so far inside the circle of a junction, of a trusted one."""
+
+SAME_START = 0.4
+"""[m] Of two cells nearer to each other than this, with the same nearest walls, one starts."""
+
+
+def _num_blocks(spec: GridSpec) -> int:
+    """Number of blocks of a grid."""
+    height, width = spec.shape
+    return math.ceil(height / BLOCK) * math.ceil(width / BLOCK)
+
 
 def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
     """The marked cells nearest to the robot, one of each block of `BLOCK` x `BLOCK` at most.
@@ -121,12 +136,39 @@ _Start = tuple[Array, Array, Array, Array]
 """Initial centres x and y (C,), walls (3, C), and whether there is one (C,), of C circles."""
 
 
+def _starts(
+    cells: Array, walls: WallSegments, grid: GridSpec, spec: FeatureSpec, dtype: jnp.dtype
+) -> _Start:
+    """Where to search for junctions: `spec.num_candidates` cells, each with its nearest walls.
+
+    A junction marks several cells, and in clutter most junctions are too close to walls. Of the
+    nearest `CELLS_PER_START` times as many cells, those are left out whose clearance is out of
+    limits by more than a cell, and those with the three nearest walls of a cell close by.
+    """
+    found_cells, blocks = CELLS_PER_START * spec.num_candidates, _num_blocks(grid)
+    index, found = _nearest_cells(cells, grid, min(found_cells, blocks))
+    xy = centre_of(grid, index).astype(dtype)
+    x, y = xy[:, 0], xy[:, 1]
+    foot = foot_points(x, y, walls)
+    three = nearest_three_walls(foot, math.cos(0.7 * spec.min_foot_angle))
+    clearance = jnp.min(foot.distance, axis=0)
+    found &= clearance > spec.min_clearance - grid.cell_size
+    found &= clearance < spec.max_clearance + grid.cell_size
+    walls_of = jnp.sort(three, axis=0)
+    same = jnp.all(walls_of[:, :, None] == walls_of[:, None], axis=0)
+    same &= jnp.hypot(x[:, None] - x[None], y[:, None] - y[None]) < SAME_START
+    found &= ~jnp.any(jnp.tril(same, -1) & found[None], axis=1)
+    first = jnp.argsort(~found, stable=True)[: spec.num_candidates]
+    return x[first], y[first], three[:, first], found[first]
+
+
 def _tangent_circles(
     cells: Array, walls: WallSegments, grid: GridSpec, spec: FeatureSpec, dtype: jnp.dtype
 ) -> tuple[TangentCircles, Array]:
     """Empty circles through three walls each, found from the junction cells in two rounds.
 
-        round 1:  centre = a junction cell;  walls = the three nearest in different directions
+        round 1:  centre and walls = `_starts`: a junction cell, the three nearest walls in
+                  different directions
         round 2:  centre and walls = `_neighbours` of the best circles of round 1
         each:     solve and exchange walls (`tangent_circles`);
                   drop circles that a wall cuts, whose feet are close together, or that moved > 1 m;
@@ -137,11 +179,6 @@ def _tangent_circles(
     Returns:
         The best 2 N circles of both rounds, best first, and whether there is one: (2 N,) bool.
     """
-    index, found = _nearest_cells(cells, grid, spec.num_candidates)
-    xy = centre_of(grid, index).astype(dtype)
-    x, y = xy[:, 0], xy[:, 1]
-    max_cosine = math.cos(0.7 * spec.min_foot_angle)
-    three = nearest_three_walls(foot_points(x, y, walls), max_cosine)
 
     def search(start: _Start, _: None) -> tuple[_Start, tuple[TangentCircles, Array]]:
         x, y, three, found = start
@@ -159,27 +196,38 @@ def _tangent_circles(
         x, y, three = _neighbours(jax.tree.map(lambda a: a[..., best], circle))
         return (x, y, three, jnp.repeat(found, 3)), (circle, score)
 
-    _, (rounds, score) = lax.scan(search, (x, y, three, found), length=2)
+    start = _starts(cells, walls, grid, spec, dtype)
+    _, (rounds, score) = lax.scan(search, start, length=2)
     circle = jax.tree.map(lambda a: jnp.concatenate([a[0], a[1]], axis=-1), rounds)
     xy = jnp.stack([circle.x, circle.y], axis=1)
     best, found = _best_apart(score.reshape(-1), xy, spec.min_separation, 2 * spec.max_junctions)
     return jax.tree.map(lambda a: a[..., best], circle), found
 
 
+def _intrusion(circle: FittedCircles, scan: Scan, lidar: Lidar) -> Array:
+    """Depth (C,) [m] to which beam ends are inside circles; negative if none is."""
+    hits = beam_ends(lidar, scan)
+    offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
+    return circle.radius - jnp.min(jnp.where(scan.hit[None], offset, jnp.inf), axis=1)
+
+
 def _is_junction(
-    circle: FittedCircles, trace: Array, scan: Scan, lidar: Lidar, spec: FeatureSpec
+    circle: FittedCircles,
+    trace: Array,
+    intrusion: Array,
+    scan: Scan,
+    lidar: Lidar,
+    spec: FeatureSpec,
 ) -> Array:
     """Whether fitted circles (C,) are junctions that may be observed.
 
-    The circle is empty of walls and of beam ends, every foot is real, the radius is within limits,
-    the centre is located well (`trace` (C,) [m^2] of its covariance) and in sight.
+    The circle is empty of walls and, but for the steps of a rough wall, of beam ends (`intrusion`
+    (C,) [m]); every foot is real, the radius is within limits, the centre is located well (`trace`
+    (C,) [m^2] of its covariance) and in sight.
     """
     good = circle.feet_real & (circle.penetration < 0.05) & (trace < 0.02)
     good &= (circle.radius > spec.min_clearance) & (circle.radius < spec.max_clearance)
-    hits = beam_ends(lidar, scan)
-    offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
-    clearance = jnp.min(jnp.where(scan.hit[None], offset, jnp.inf), axis=1)
-    good &= clearance > circle.radius - max(0.05, 4 * lidar.range_std)
+    good &= intrusion < max(MAX_STEP, 4 * lidar.range_std)
     return good & in_free_view(lidar, circle.centre, scan.ranges)
 
 
@@ -210,13 +258,15 @@ def find_junctions(
         segments: Its straight segments.
 
     Returns:
-        `spec.max_junctions` features of kind `JUNCTION`, trusted ones first; robot frame.
+        `spec.max_junctions` features of kind `JUNCTION`, trusted ones first, then those whose
+        circle was seen; robot frame.
     """
     dtype = scan.ranges.dtype
     tangent, found = _tangent_circles(cells, wall_segments(segments), grid, spec, dtype)
     circle = fit_circles(tangent, segments, within=spec.tangency_gate, thick=spec.wall_thickness)
     trace = jnp.trace(circle.cov, axis1=1, axis2=2)
-    good = found & _is_junction(circle, trace, scan, lidar, spec)
+    intrusion = _intrusion(circle, scan, lidar)
+    good = found & _is_junction(circle, trace, intrusion, scan, lidar, spec)
     area, certified = _seen_fraction(lidar, circle.centre, circle.radius, scan)
     trusted = (
         good
@@ -224,11 +274,13 @@ def find_junctions(
         & (tangent.min_angle > spec.min_foot_angle)
         & (trace < 0.005)
     )
+    trusted &= intrusion < max(MAX_TRUSTED_STEP, 4 * lidar.range_std)
     trusted &= (circle.radius > 1.2 * spec.min_clearance) & (
         circle.hidden_depth < spec.max_hidden_depth
     )
-    # Angles are below 4: trusted junctions come first.
-    score = jnp.where(good, jnp.where(trusted, 4.0, 0.0) + tangent.min_angle, 0.0).astype(dtype)
+    # Angles are below 4: trusted junctions come first, then those that were seen.
+    tier = 4.0 * (trusted.astype(dtype) + (area > spec.min_seen_fraction).astype(dtype))
+    score = jnp.where(good, tier + tangent.min_angle, 0.0).astype(dtype)
     best, good = _best_apart(score, circle.centre, spec.min_separation, spec.max_junctions)
     zero = jnp.zeros(spec.max_junctions, dtype)
     return zero_padding(

@@ -79,7 +79,7 @@ class SegmentSpec(NamedTuple):
             corner.
     """
 
-    max_segments: int = 31
+    max_segments: int = 48
     jump_distance: float = 0.2
     segment_cost: float = 20.0
     outlier_cost: float = 16.0
@@ -90,8 +90,11 @@ class SegmentSpec(NamedTuple):
     corner_tolerance: float = 0.15
 
 
-MAX_SEGMENTS = 32
-"""Most segments of a scan: each is one bit of a label set."""
+MAX_SEGMENTS = 64
+"""Most segments of a scan."""
+
+LABEL_BITS = 32
+"""Bits of a label set."""
 
 
 def check_segment_spec(spec: SegmentSpec) -> None:
@@ -102,6 +105,16 @@ def check_segment_spec(spec: SegmentSpec) -> None:
         raise ValueError(f"segments.max_segments is {spec.max_segments}, not 1..{MAX_SEGMENTS}")
     if spec.num_candidates < 1:
         raise ValueError(f"segments.num_candidates is {spec.num_candidates}, not 1 or more")
+
+
+def segment_bits(segment: Array) -> Array:
+    """Bit uint32 of each segment's number (...) in a label set, 0 where it is negative.
+
+    Segments `LABEL_BITS` apart share a bit: no branch between them is in the label sets of the
+    diagram. Junctions are not lost: they are found from the numbers.
+    """
+    shift = (jnp.maximum(segment, 0) % LABEL_BITS).astype(jnp.uint32)
+    return jnp.where(segment >= 0, jnp.uint32(1) << shift, jnp.uint32(0))
 
 
 def segment_cells(

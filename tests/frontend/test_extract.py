@@ -114,9 +114,9 @@ GOOD = to_scan(LIDAR, RANGES)
         (SMALL._replace(grid=GridSpec(x_max=np.nan)), GOOD, "not of finite numbers"),
         (SMALL._replace(grid=None), GOOD, "grid is a NoneType, not a GridSpec"),
         (
-            SMALL._replace(segments=SegmentSpec(max_segments=33)),
+            SMALL._replace(segments=SegmentSpec(max_segments=65)),
             GOOD,
-            "segments.max_segments is 33, not 1..32",
+            "segments.max_segments is 65, not 1..64",
         ),
         (SMALL._replace(segments=31), GOOD, "segments is a int, not a SegmentSpec"),
         (
@@ -170,7 +170,7 @@ LABELS, FREE = np.zeros((4, 5), np.uint8), np.ones((4, 5), bool)
         ),
         (
             lambda: find_segments(LIDAR, SegmentSpec(max_segments=0), GOOD),
-            "segments.max_segments is 0, not 1..32",
+            "segments.max_segments is 0, not 1..64",
         ),
         (
             lambda: find_segments(LIDAR, SegmentSpec(num_candidates=0), GOOD),

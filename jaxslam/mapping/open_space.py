@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from jaxslam.core.polylines import points_along
 from jaxslam.mapping.plane_graph import Line, PlaneGraph
 
-COVER = 2.0
+COVER = 1.8
 """[m] of free path, the farthest that free space may be from an arc."""
 
 MAX_DETOUR = 1.5, 3.0

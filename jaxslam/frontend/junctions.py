@@ -6,6 +6,8 @@ sub-cell accuracy, and a covariance from theirs.
 """
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +19,10 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import unit_vector
 from jaxslam.core.types import JUNCTION, Array
 from jaxslam.frontend.circle_fitting import FittedCircles, fit_circles
-from jaxslam.frontend.features import FeatureSpec
+from jaxslam.frontend.features import CANDIDATES_PER_JUNCTION, FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
 from jaxslam.frontend.lidar import beam_ends, in_free_view
+from jaxslam.frontend.pyramid import Level, largest_radius
 from jaxslam.frontend.segments import Segments
 from jaxslam.frontend.tangent_circles import (
     TangentCircles,
@@ -34,7 +37,7 @@ BLOCK = 3
 """Side [cells] of the square blocks of the grid, each of which starts one circle at most."""
 
 
-def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array]:
+def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Array, Array]:
     """The marked cells nearest to the robot, one of each block of `BLOCK` x `BLOCK` at most.
 
     Cells are ranked by nearness once, in NumPy; the largest rank of each block is left to sort.
@@ -45,7 +48,8 @@ def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Arr
         count: Number of cells wanted.
 
     Returns:
-        Index (count, 2) of the cells, nearest first, and whether there is one: (count,) bool.
+        Centres x and y (count,) [m, robot frame] of the cells, nearest first, and whether there is
+        one: (count,) bool.
     """
     height, width = spec.shape
     distance = np.hypot(
@@ -58,9 +62,11 @@ def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Arr
     key = jnp.pad(key, ((0, -height % BLOCK), (0, -width % BLOCK)))
     key = jnp.max(key.reshape(key.shape[0] // BLOCK, BLOCK, -1), axis=1)
     key = jnp.max(key.reshape(len(key), -1, BLOCK), axis=2)
-    top, _ = lax.top_k(key.reshape(-1), count)
+    top, _ = lax.top_k(key.reshape(-1), min(count, key.size))
+    top = jnp.pad(top, (0, count - top.size))
     flat = jnp.asarray(nearest_last)[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
-    return jnp.stack([flat // width, flat % width], axis=-1), top > 0.0
+    xy = centre_of(spec, jnp.stack([flat // width, flat % width], axis=-1))
+    return xy[:, 0], xy[:, 1], top > 0.0
 
 
 def _seen_fraction(lidar: Lidar, centre: Array, radius: Array, scan: Scan) -> tuple[Array, Array]:
@@ -121,73 +127,152 @@ _Start = tuple[Array, Array, Array, Array]
 """Initial centres x and y (C,), walls (3, C), and whether there is one (C,), of C circles."""
 
 
+def _best_of_levels(
+    score: Array, xy: Array, min_distance: float, counts: Sequence[int], factor: int
+) -> tuple[Array, Array]:
+    """`_best_apart` of each level on its own, whose circles follow each other.
+
+    Args:
+        score: (C,) larger is better; 0 or less excludes a circle.
+        xy: (C, 2) [m].
+        min_distance: [m].
+        counts: Number of circles of each level wanted.
+        factor: How many times as many there are.
+
+    Returns:
+        Index (sum(counts),) of the circles, and whether there is one, of the same shape.
+    """
+    picked, first = [], 0
+    for count in counts:
+        own = slice(first, first + factor * count)
+        best, found = _best_apart(score[own], xy[own], min_distance, count)
+        picked.append((best + first, found))
+        first += factor * count
+    best, found = (jnp.concatenate(x) for x in zip(*picked, strict=True))
+    return best, found
+
+
+def _per_circle(levels: Sequence[Level], spec: FeatureSpec, each: int) -> list[np.ndarray]:
+    """Level and scale (C,) of circles, `each` for every junction that a level may have."""
+    number = np.repeat(range(len(levels)), np.array(spec.junctions_of(len(levels))) * each)
+    return [number, np.array([level.scale for level in levels])[number]]
+
+
+def _not_of_finer(
+    x: Array, y: Array, radius: Array, levels: Sequence[Level], of: np.ndarray
+) -> Array:
+    """Whether circles (C,) are beyond what the levels finer than theirs can hold.
+
+    Args:
+        x: (C,) [m] of the centres, robot frame.
+        y: (C,) [m] of the centres, robot frame.
+        radius: (C,) [m].
+        levels: All levels, the finest first.
+        of: (C,) number of the level of each circle, static.
+    """
+    good = jnp.ones(x.shape, bool)
+    for k, (finer, level) in enumerate(pairwise(levels)):
+        good &= jnp.asarray(of <= k) | (radius > largest_radius(x, y, finer, level))
+    return good
+
+
 def _tangent_circles(
-    cells: Array, walls: WallSegments, grid: GridSpec, spec: FeatureSpec, dtype: jnp.dtype
+    cells: Sequence[Array],
+    walls: WallSegments,
+    levels: Sequence[Level],
+    spec: FeatureSpec,
+    dtype: jnp.dtype,
 ) -> tuple[TangentCircles, Array]:
     """Empty circles through three walls each, found from the junction cells in two rounds.
 
         round 1:  centre = a junction cell;  walls = the three nearest in different directions
         round 2:  centre and walls = `_neighbours` of the best circles of round 1
         each:     solve and exchange walls (`tangent_circles`);
-                  drop circles that a wall cuts, whose feet are close together, or that moved > 1 m;
-                  score = smallest angle between two feet;  suppress duplicates
+                  drop circles that a wall cuts, whose feet are close together, that moved by more
+                  than ten cells, or that a finer level can hold;
+                  score = smallest angle between two feet;  suppress duplicates, level by level
 
-    Both rounds have C = 3 N circles, N = `spec.max_junctions`, so they are one scanned program.
+    Both rounds have C = 3 N circles, N the sum of `spec.junctions_of(len(levels))`, so they are one
+    scanned program.
 
     Returns:
-        The best 2 N circles of both rounds, best first, and whether there is one: (2 N,) bool.
+        The best 2 N circles of both rounds, level by level, best first, and whether there is one:
+        (2 N,) bool.
     """
-    index, found = _nearest_cells(cells, grid, spec.num_candidates)
-    xy = centre_of(grid, index).astype(dtype)
-    x, y = xy[:, 0], xy[:, 1]
+    counts = spec.junctions_of(len(levels))
+    nearest = [
+        _nearest_cells(own, level.grid, CANDIDATES_PER_JUNCTION * count)
+        for own, level, count in zip(cells, levels, counts, strict=True)
+    ]
+    x, y, found = (jnp.concatenate(parts) for parts in zip(*nearest, strict=True))
+    x, y = x.astype(dtype), y.astype(dtype)
+    of_level, scale = _per_circle(levels, spec, CANDIDATES_PER_JUNCTION)
+    max_step, max_move = jnp.asarray(0.4 * scale, dtype), jnp.asarray(scale, dtype)
     max_cosine = math.cos(0.7 * spec.min_foot_angle)
     three = nearest_three_walls(foot_points(x, y, walls), max_cosine)
 
     def search(start: _Start, _: None) -> tuple[_Start, tuple[TangentCircles, Array]]:
         x, y, three, found = start
-        circle = tangent_circles(x, y, three, walls, swaps=3)
+        circle = tangent_circles(x, y, three, walls, swaps=3, max_step=max_step)
         moved = jnp.hypot(circle.x - x, circle.y - y)
         good = (
             found
             & (circle.penetration < 0.05)
             & (circle.min_angle > 0.7 * spec.min_foot_angle)
-            & (moved < 1.0)
+            & (moved < max_move)
+            & _not_of_finer(circle.x, circle.y, circle.radius, levels, of_level)
         )
         score = jnp.where(good, circle.min_angle, 0.0)
         xy = jnp.stack([circle.x, circle.y], axis=1)
-        best, found = _best_apart(score, xy, spec.min_separation, spec.max_junctions)
+        best, found = _best_of_levels(
+            score, xy, spec.min_separation, counts, CANDIDATES_PER_JUNCTION
+        )
         x, y, three = _neighbours(jax.tree.map(lambda a: a[..., best], circle))
         return (x, y, three, jnp.repeat(found, 3)), (circle, score)
 
     _, (rounds, score) = lax.scan(search, (x, y, three, found), length=2)
-    circle = jax.tree.map(lambda a: jnp.concatenate([a[0], a[1]], axis=-1), rounds)
+    # Both rounds of a level follow each other.
+    order = np.argsort(np.tile(of_level, 2), kind="stable")
+    circle = jax.tree.map(lambda a: jnp.concatenate([a[0], a[1]], axis=-1)[..., order], rounds)
     xy = jnp.stack([circle.x, circle.y], axis=1)
-    best, found = _best_apart(score.reshape(-1), xy, spec.min_separation, 2 * spec.max_junctions)
+    best, found = _best_of_levels(
+        score.reshape(-1)[order],
+        xy,
+        spec.min_separation,
+        [2 * count for count in counts],
+        CANDIDATES_PER_JUNCTION,
+    )
     return jax.tree.map(lambda a: a[..., best], circle), found
 
 
 def _is_junction(
-    circle: FittedCircles, trace: Array, scan: Scan, lidar: Lidar, spec: FeatureSpec
+    circle: FittedCircles,
+    trace: Array,
+    max_radius: Array,
+    scan: Scan,
+    lidar: Lidar,
+    spec: FeatureSpec,
 ) -> Array:
     """Whether fitted circles (C,) are junctions that may be observed.
 
-    The circle is empty of walls and of beam ends, every foot is real, the radius is within limits,
-    the centre is located well (`trace` (C,) [m^2] of its covariance) and in sight.
+    The circle is empty of walls and of beam ends, every foot is real, the radius is within limits
+    (up to `max_radius` (C,) [m]), the centre is located well (`trace` (C,) [m^2] of its covariance)
+    and in sight.
     """
     good = circle.feet_real & (circle.penetration < 0.05) & (trace < 0.02)
-    good &= (circle.radius > spec.min_clearance) & (circle.radius < spec.max_clearance)
-    hits = beam_ends(lidar, scan)
-    offset = jnp.linalg.norm(circle.centre[:, None] - hits[None], axis=2)
-    clearance = jnp.min(jnp.where(scan.hit[None], offset, jnp.inf), axis=1)
+    good &= (circle.radius > spec.min_clearance) & (circle.radius < max_radius)
+    hits = jnp.where(scan.hit[:, None], beam_ends(lidar, scan), jnp.inf)
+    dx, dy = (circle.centre[:, None, k] - hits[None, :, k] for k in range(2))
+    clearance = jnp.sqrt(jnp.min(dx * dx + dy * dy, axis=1))
     good &= clearance > circle.radius - max(0.05, 4 * lidar.range_std)
     return good & in_free_view(lidar, circle.centre, scan.ranges)
 
 
 def find_junctions(
     lidar: Lidar,
-    grid: GridSpec,
+    levels: Sequence[Level],
     spec: FeatureSpec,
-    cells: Array,
+    cells: Sequence[Array],
     scan: Scan,
     segments: Segments,
 ) -> Features:
@@ -201,22 +286,29 @@ def find_junctions(
     A junction is kept if its circle is empty, touches at least three walls in directions that
     differ, and every foot is real: no foot is an end made by occlusion or by the field of view.
 
+    A junction belongs to the finest level that can hold it. Those of coarser levels take the slots
+    that the finest leaves: they never displace one of it.
+
     Args:
         lidar: The scanner.
-        grid: The grid of `cells`.
+        levels: The levels of the diagram, the finest first.
         spec: Capacities and limits.
-        cells: (H, W) bool, the junction cells.
+        cells: (H, W) bool of each level, its junction cells.
         scan: The scan.
         segments: Its straight segments.
 
     Returns:
-        `spec.max_junctions` features of kind `JUNCTION`, trusted ones first; robot frame.
+        `spec.max_junctions` features of kind `JUNCTION`, the finest level first, of each level
+        trusted ones first; robot frame.
     """
     dtype = scan.ranges.dtype
-    tangent, found = _tangent_circles(cells, wall_segments(segments), grid, spec, dtype)
+    tangent, found = _tangent_circles(cells, wall_segments(segments), levels, spec, dtype)
+    of_level, scale = _per_circle(levels, spec, 2)
     circle = fit_circles(tangent, segments, within=spec.tangency_gate, thick=spec.wall_thickness)
     trace = jnp.trace(circle.cov, axis1=1, axis2=2)
-    good = found & _is_junction(circle, trace, scan, lidar, spec)
+    max_radius = jnp.asarray(spec.max_clearance * scale, dtype)
+    good = found & _is_junction(circle, trace, max_radius, scan, lidar, spec)
+    good &= _not_of_finer(circle.centre[:, 0], circle.centre[:, 1], circle.radius, levels, of_level)
     area, certified = _seen_fraction(lidar, circle.centre, circle.radius, scan)
     trusted = (
         good
@@ -227,8 +319,10 @@ def find_junctions(
     trusted &= (circle.radius > 1.2 * spec.min_clearance) & (
         circle.hidden_depth < spec.max_hidden_depth
     )
-    # Angles are below 4: trusted junctions come first.
-    score = jnp.where(good, jnp.where(trusted, 4.0, 0.0) + tangent.min_angle, 0.0).astype(dtype)
+    # Angles are below 4: trusted junctions come first, on each level.
+    rank = jnp.where(trusted, 4.0, 0.0) + tangent.min_angle
+    rank += jnp.asarray(8.0 * (len(levels) - 1 - of_level), dtype)
+    score = jnp.where(good, rank, 0.0).astype(dtype)
     best, good = _best_apart(score, circle.centre, spec.min_separation, spec.max_junctions)
     zero = jnp.zeros(spec.max_junctions, dtype)
     return zero_padding(

@@ -45,7 +45,8 @@ def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
     beam = jnp.where(beam < -0.5, beam + 2 * jnp.pi / lidar.angle_increment, beam)
     low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.num_beams - 2)
     within = (beam > -0.5) & (beam < lidar.num_beams - 0.5)
-    return within & (jnp.linalg.norm(points, axis=-1) < jnp.minimum(ranges[low], ranges[low + 1]))
+    nearer = jnp.minimum(ranges[:-1], ranges[1:])
+    return within & (jnp.linalg.norm(points, axis=-1) < nearer[low])
 
 
 def begin_behind(lidar: Lidar, scan: Scan) -> tuple[Lidar, Scan]:

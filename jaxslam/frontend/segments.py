@@ -90,6 +90,9 @@ class SegmentSpec(NamedTuple):
     corner_tolerance: float = 0.15
 
 
+POINTS_PER_GAP = 6
+"""Points drawn from each hit to the next of the same segment, on cells of 10 cm."""
+
 MAX_SEGMENTS = 32
 """Most segments of a scan: each is one bit of a label set."""
 
@@ -105,7 +108,12 @@ def check_segment_spec(spec: SegmentSpec) -> None:
 
 
 def segment_cells(
-    lidar: Lidar, spec: GridSpec, scan: Scan, segments: Segments, *, points_per_gap: int = 6
+    lidar: Lidar,
+    spec: GridSpec,
+    scan: Scan,
+    segments: Segments,
+    *,
+    points_per_gap: int = POINTS_PER_GAP,
 ) -> Array:
     """Segment (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
 

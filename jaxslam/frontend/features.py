@@ -11,9 +11,6 @@ from jaxslam.core.se2 import cross, dot, unit_vector, wrap_angle, wrap_direction
 from jaxslam.core.types import CORNER, JUNCTION, WALL, Array, as_bool, as_float
 from jaxslam.frontend.segments import Segments
 
-CANDIDATES_PER_JUNCTION = 3
-"""Number of cells at which junctions are searched, for each junction that there may be."""
-
 
 class FeatureSpec(NamedTuple):
     """How many features a scan may have, and their thresholds; static under jit.
@@ -35,8 +32,8 @@ class FeatureSpec(NamedTuple):
             difference of the turn from pi.
         tangency_gate: A wall touches the circle of a junction if it is within so many standard
             deviations of it.
-        max_coarse_junctions: Largest number of junctions of each coarser level of the pyramid, in
-            slots that the finest leaves.
+        max_coarse_candidates: Number of cells of each coarser level of the pyramid at which
+            junctions are searched.
     """
 
     max_junctions: int = 8
@@ -53,17 +50,12 @@ class FeatureSpec(NamedTuple):
     min_corner_length: float = 0.12
     min_corner_angle: float = 0.6
     tangency_gate: float = 1.5
-    max_coarse_junctions: int = 4
+    max_coarse_candidates: int = 8
 
     @property
     def num_candidates(self) -> int:
-        """Number of cells of the finest level at which junctions are searched."""
-        return CANDIDATES_PER_JUNCTION * self.max_junctions
-
-    def junctions_of(self, num_levels: int) -> list[int]:
-        """Largest number of junctions that is searched on each level, the finest first."""
-        coarse = min(self.max_coarse_junctions, self.max_junctions)
-        return [self.max_junctions] + [coarse] * (num_levels - 1)
+        """Number of cells of the finest level at which junctions are searched: three for each."""
+        return 3 * self.max_junctions
 
     @property
     def max_features(self) -> int:
@@ -75,7 +67,7 @@ def check_feature_spec(spec: FeatureSpec) -> None:
     """Raise ValueError, naming the field, unless capacities of features are possible."""
     if not isinstance(spec, FeatureSpec):
         raise ValueError(f"features is a {type(spec).__name__}, not a FeatureSpec")
-    for name in ("max_junctions", "max_corners", "max_walls", "max_coarse_junctions"):
+    for name in ("max_junctions", "max_corners", "max_walls", "max_coarse_candidates"):
         if getattr(spec, name) < 0:
             raise ValueError(f"features.{name} is {getattr(spec, name)}, not 0 or more")
 

@@ -19,7 +19,7 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import unit_vector
 from jaxslam.core.types import JUNCTION, Array
 from jaxslam.frontend.circle_fitting import FittedCircles, fit_circles
-from jaxslam.frontend.features import CANDIDATES_PER_JUNCTION, FeatureSpec
+from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
 from jaxslam.frontend.lidar import beam_ends, in_free_view
 from jaxslam.frontend.pyramid import Level, largest_radius
@@ -127,122 +127,104 @@ _Start = tuple[Array, Array, Array, Array]
 """Initial centres x and y (C,), walls (3, C), and whether there is one (C,), of C circles."""
 
 
-def _best_of_levels(
-    score: Array, xy: Array, min_distance: float, counts: Sequence[int], factor: int
-) -> tuple[Array, Array]:
-    """`_best_apart` of each level on its own, whose circles follow each other.
+def _search(
+    start: _Start, walls: WallSegments, spec: FeatureSpec, scale: float
+) -> tuple[TangentCircles, Array]:
+    """Empty circles through three walls each, and their scores (C,): 0 for none.
+
+    Solve and exchange walls (`tangent_circles`); drop circles that a wall cuts, whose feet are
+    close together, or that moved by more than ten cells. The score is the smallest angle between
+    two feet.
 
     Args:
-        score: (C,) larger is better; 0 or less excludes a circle.
-        xy: (C, 2) [m].
-        min_distance: [m].
-        counts: Number of circles of each level wanted.
-        factor: How many times as many there are.
-
-    Returns:
-        Index (sum(counts),) of the circles, and whether there is one, of the same shape.
+        start: Where to search.
+        walls: The walls.
+        spec: Limits.
+        scale: Side of the cells in those of the finest level.
     """
-    picked, first = [], 0
-    for count in counts:
-        own = slice(first, first + factor * count)
-        best, found = _best_apart(score[own], xy[own], min_distance, count)
-        picked.append((best + first, found))
-        first += factor * count
-    best, found = (jnp.concatenate(x) for x in zip(*picked, strict=True))
-    return best, found
+    x, y, three, found = start
+    circle = tangent_circles(x, y, three, walls, swaps=3, max_step=0.4 * scale)
+    moved = jnp.hypot(circle.x - x, circle.y - y)
+    good = (
+        found
+        & (circle.penetration < 0.05)
+        & (circle.min_angle > 0.7 * spec.min_foot_angle)
+        & (moved < 1.0 * scale)
+    )
+    return circle, jnp.where(good, circle.min_angle, 0.0)
 
 
-def _per_circle(levels: Sequence[Level], spec: FeatureSpec, each: int) -> list[np.ndarray]:
-    """Level and scale (C,) of circles, `each` for every junction that a level may have."""
-    number = np.repeat(range(len(levels)), np.array(spec.junctions_of(len(levels))) * each)
-    return [number, np.array([level.scale for level in levels])[number]]
-
-
-def _not_of_finer(
-    x: Array, y: Array, radius: Array, levels: Sequence[Level], of: np.ndarray
-) -> Array:
-    """Whether circles (C,) are beyond what the levels finer than theirs can hold.
-
-    Args:
-        x: (C,) [m] of the centres, robot frame.
-        y: (C,) [m] of the centres, robot frame.
-        radius: (C,) [m].
-        levels: All levels, the finest first.
-        of: (C,) number of the level of each circle, static.
-    """
-    good = jnp.ones(x.shape, bool)
-    for k, (finer, level) in enumerate(pairwise(levels)):
-        good &= jnp.asarray(of <= k) | (radius > largest_radius(x, y, finer, level))
-    return good
+def _start(
+    cells: Array, level: Level, count: int, walls: WallSegments, spec: FeatureSpec, dtype: jnp.dtype
+) -> _Start:
+    """Start at the marked cells with the three nearest walls in different directions."""
+    x, y, found = _nearest_cells(cells, level.grid, count)
+    x, y = x.astype(dtype), y.astype(dtype)
+    max_cosine = math.cos(0.7 * spec.min_foot_angle)
+    return x, y, nearest_three_walls(foot_points(x, y, walls), max_cosine), found
 
 
 def _tangent_circles(
-    cells: Sequence[Array],
-    walls: WallSegments,
-    levels: Sequence[Level],
-    spec: FeatureSpec,
-    dtype: jnp.dtype,
+    cells: Array, walls: WallSegments, level: Level, spec: FeatureSpec, dtype: jnp.dtype
 ) -> tuple[TangentCircles, Array]:
     """Empty circles through three walls each, found from the junction cells in two rounds.
 
         round 1:  centre = a junction cell;  walls = the three nearest in different directions
         round 2:  centre and walls = `_neighbours` of the best circles of round 1
-        each:     solve and exchange walls (`tangent_circles`);
-                  drop circles that a wall cuts, whose feet are close together, that moved by more
-                  than ten cells, or that a finer level can hold;
-                  score = smallest angle between two feet;  suppress duplicates, level by level
+        each:     `_search`;  suppress duplicates
 
-    Both rounds have C = 3 N circles, N the sum of `spec.junctions_of(len(levels))`, so they are one
-    scanned program.
+    Both rounds have C = 3 N circles, N = `spec.max_junctions`, so they are one scanned program.
 
     Returns:
-        The best 2 N circles of both rounds, level by level, best first, and whether there is one:
-        (2 N,) bool.
+        The best 2 N circles of both rounds, best first, and whether there is one: (2 N,) bool.
     """
-    counts = spec.junctions_of(len(levels))
-    nearest = [
-        _nearest_cells(own, level.grid, CANDIDATES_PER_JUNCTION * count)
-        for own, level, count in zip(cells, levels, counts, strict=True)
-    ]
-    x, y, found = (jnp.concatenate(parts) for parts in zip(*nearest, strict=True))
-    x, y = x.astype(dtype), y.astype(dtype)
-    of_level, scale = _per_circle(levels, spec, CANDIDATES_PER_JUNCTION)
-    max_step, max_move = jnp.asarray(0.4 * scale, dtype), jnp.asarray(scale, dtype)
-    max_cosine = math.cos(0.7 * spec.min_foot_angle)
-    three = nearest_three_walls(foot_points(x, y, walls), max_cosine)
 
     def search(start: _Start, _: None) -> tuple[_Start, tuple[TangentCircles, Array]]:
-        x, y, three, found = start
-        circle = tangent_circles(x, y, three, walls, swaps=3, max_step=max_step)
-        moved = jnp.hypot(circle.x - x, circle.y - y)
-        good = (
-            found
-            & (circle.penetration < 0.05)
-            & (circle.min_angle > 0.7 * spec.min_foot_angle)
-            & (moved < max_move)
-            & _not_of_finer(circle.x, circle.y, circle.radius, levels, of_level)
-        )
-        score = jnp.where(good, circle.min_angle, 0.0)
+        circle, score = _search(start, walls, spec, level.scale)
         xy = jnp.stack([circle.x, circle.y], axis=1)
-        best, found = _best_of_levels(
-            score, xy, spec.min_separation, counts, CANDIDATES_PER_JUNCTION
-        )
+        best, found = _best_apart(score, xy, spec.min_separation, spec.max_junctions)
         x, y, three = _neighbours(jax.tree.map(lambda a: a[..., best], circle))
         return (x, y, three, jnp.repeat(found, 3)), (circle, score)
 
-    _, (rounds, score) = lax.scan(search, (x, y, three, found), length=2)
-    # Both rounds of a level follow each other.
-    order = np.argsort(np.tile(of_level, 2), kind="stable")
-    circle = jax.tree.map(lambda a: jnp.concatenate([a[0], a[1]], axis=-1)[..., order], rounds)
+    start = _start(cells, level, spec.num_candidates, walls, spec, dtype)
+    _, (rounds, score) = lax.scan(search, start, length=2)
+    circle = jax.tree.map(lambda a: jnp.concatenate([a[0], a[1]], axis=-1), rounds)
     xy = jnp.stack([circle.x, circle.y], axis=1)
-    best, found = _best_of_levels(
-        score.reshape(-1)[order],
-        xy,
-        spec.min_separation,
-        [2 * count for count in counts],
-        CANDIDATES_PER_JUNCTION,
-    )
+    best, found = _best_apart(score.reshape(-1), xy, spec.min_separation, 2 * spec.max_junctions)
     return jax.tree.map(lambda a: a[..., best], circle), found
+
+
+def _circles_of_levels(
+    cells: Sequence[Array],
+    walls: WallSegments,
+    levels: Sequence[Level],
+    spec: FeatureSpec,
+    dtype: jnp.dtype,
+) -> tuple[TangentCircles, Array, np.ndarray]:
+    """Empty circles of all levels: those of `_tangent_circles`, and of one round on coarser ones.
+
+    Returns:
+        The circles, whether there is one (C,) bool, and the level (C,) of each, static.
+    """
+    circle, found = _tangent_circles(cells[0], walls, levels[0], spec, dtype)
+    parts, of_level = [(circle, found)], [0] * len(found)
+    for k, (own, level) in enumerate(zip(cells[1:], levels[1:], strict=True), 1):
+        start = _start(own, level, spec.max_coarse_candidates, walls, spec, dtype)
+        circle, score = _search(start, walls, spec, level.scale)
+        parts.append((circle, score > 0.0))
+        of_level += [k] * len(score)
+    circle, found = jax.tree.map(lambda *part: jnp.concatenate(part, axis=-1), *parts)
+    return circle, found, np.array(of_level)
+
+
+def _not_of_finer(circle: FittedCircles, levels: Sequence[Level], of_level: np.ndarray) -> Array:
+    """Whether circles (C,) are beyond what the levels finer than theirs, `of_level`, can hold."""
+    good = jnp.ones(circle.radius.shape, bool)
+    for k, (finer, level) in enumerate(pairwise(levels)):
+        x, y = circle.centre[:, 0], circle.centre[:, 1]
+        held = circle.radius <= largest_radius(x, y, finer, level)
+        good &= ~(jnp.asarray(of_level > k) & held)
+    return good
 
 
 def _is_junction(
@@ -302,13 +284,14 @@ def find_junctions(
         trusted ones first; robot frame.
     """
     dtype = scan.ranges.dtype
-    tangent, found = _tangent_circles(cells, wall_segments(segments), levels, spec, dtype)
-    of_level, scale = _per_circle(levels, spec, 2)
+    tangent, found, of_level = _circles_of_levels(
+        cells, wall_segments(segments), levels, spec, dtype
+    )
     circle = fit_circles(tangent, segments, within=spec.tangency_gate, thick=spec.wall_thickness)
     trace = jnp.trace(circle.cov, axis1=1, axis2=2)
-    max_radius = jnp.asarray(spec.max_clearance * scale, dtype)
-    good = found & _is_junction(circle, trace, max_radius, scan, lidar, spec)
-    good &= _not_of_finer(circle.centre[:, 0], circle.centre[:, 1], circle.radius, levels, of_level)
+    max_radius = spec.max_clearance * np.array([level.scale for level in levels])[of_level]
+    good = found & _is_junction(circle, trace, jnp.asarray(max_radius, dtype), scan, lidar, spec)
+    good &= _not_of_finer(circle, levels, of_level)
     area, certified = _seen_fraction(lidar, circle.centre, circle.radius, scan)
     trusted = (
         good

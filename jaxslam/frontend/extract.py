@@ -11,13 +11,14 @@ from jaxslam.core.batching import map_batches
 from jaxslam.core.features import Features, concatenate_features
 from jaxslam.core.scan import Scan, as_scan
 from jaxslam.core.types import Array
-from jaxslam.frontend import automaton, edge_codes, junctions, local_graph, segmentation, voronoi
+from jaxslam.frontend import automaton, edge_codes, junctions, segmentation, voronoi
 from jaxslam.frontend.automaton import Diagram, EncodedDiagram
 from jaxslam.frontend.config import FrontendConfig, check_config
 from jaxslam.frontend.features import find_corners, find_wall_directions
 from jaxslam.frontend.grid import rasterise, seen_free
 from jaxslam.frontend.lidar import begin_behind
 from jaxslam.frontend.local_graph import LocalArcs
+from jaxslam.frontend.local_pyramid import find_pyramid_arcs
 from jaxslam.frontend.pyramid import Level, beyond_finer
 from jaxslam.frontend.segments import POINTS_PER_GAP, Segments, segment_cells
 
@@ -150,11 +151,9 @@ def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, L
     Raises:
         ValueError: As of `extract_features`, or there may be more than 31 junctions.
     """
-    features, diagram, sources = extract_diagram(config, scan)
+    features, diagrams = extract_levels(config, scan)
     lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
-    arcs = local_graph.find_local_arcs(
-        lidar, config.grid, config.features, features, diagram, sources, scan
-    )
+    arcs = find_pyramid_arcs(lidar, config.pyramid(), config.features, features, diagrams, scan)
     return features, arcs
 
 

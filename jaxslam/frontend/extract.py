@@ -1,5 +1,6 @@
 """The front end as a whole: from a scan to features, and to the local topological map."""
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxslam.core import trace_cache
 from jaxslam.core.batching import map_batches
 from jaxslam.core.features import Features, concatenate_features
-from jaxslam.core.scan import Scan, as_scan
+from jaxslam.core.scan import Lidar, Scan, as_scan
 from jaxslam.core.types import Array
 from jaxslam.frontend import automaton, edge_codes, junctions, segmentation, voronoi
 from jaxslam.frontend.automaton import Diagram, EncodedDiagram
@@ -85,6 +86,31 @@ def extract_diagram(config: FrontendConfig, scan: Scan) -> tuple[Features, Diagr
     return features, *finest
 
 
+def level_segments(lidar: Lidar, level: Level, scan: Scan, segments: Segments) -> Array:
+    """`segment_cells` on the grid of a level; larger cells need fewer points."""
+    points = max(3, round(POINTS_PER_GAP / level.scale))
+    return segment_cells(lidar, level.grid, scan, segments, points_per_gap=points)
+
+
+def junction_cells(
+    levels: Sequence[Level], encoded: Sequence[EncodedDiagram], sources: Sequence[Array]
+) -> list[Array]:
+    """Junction cells (H, W) bool of each level; of a coarser one, those that no finer one holds.
+
+    Args:
+        levels: The levels, the finest first.
+        encoded: The diagram of each.
+        sources: (H, W) bool of each, the cells that fronts started from.
+    """
+    cells = [
+        voronoi.encoded_junction_cells(own, start)
+        for own, start in zip(encoded, sources, strict=True)
+    ]
+    for k, (finer, level) in enumerate(pairwise(levels), 1):
+        cells[k] &= beyond_finer(encoded[k].arrival, level, finer)
+    return cells
+
+
 def _grow(
     config: FrontendConfig, level: Level, scan: Scan, segments: Segments
 ) -> tuple[LevelDiagram, EncodedDiagram]:
@@ -96,9 +122,7 @@ def _grow(
         start = automaton.encode_sources(labels, grid.free)
         sources = grid.occupied
     else:
-        # Cells that are larger hold more points.
-        points = max(3, round(POINTS_PER_GAP / level.scale))
-        segment = segment_cells(lidar, spec, scan, segments, points_per_gap=points)
+        segment = level_segments(lidar, level, scan, segments)
         sources = segment >= 0
         bit = jnp.uint32(1) << jnp.maximum(segment, 0).astype(jnp.uint32)
         labels = jnp.where(sources, bit, 0)
@@ -130,9 +154,7 @@ def extract_levels(config: FrontendConfig, scan: Scan) -> tuple[Features, tuple[
     levels = config.pyramid()
     segments = segmentation.find_segments(lidar, config.segments, scan)
     grown = [_grow(config._replace(lidar=lidar), level, scan, segments) for level in levels]
-    cells = [voronoi.encoded_junction_cells(own, found.sources) for found, own in grown]
-    for k, (finer, level) in enumerate(pairwise(levels), 1):
-        cells[k] &= beyond_finer(grown[k][1].arrival, level, finer)
+    cells = junction_cells(levels, [own for _, own in grown], [found.sources for found, _ in grown])
     features = concatenate_features(
         junctions.find_junctions(lidar, levels, config.features, cells, scan, segments),
         find_corners(config.features, segments),

@@ -16,12 +16,11 @@ from jax import lax
 
 from jaxslam.core.features import Features, zero_padding
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.se2 import unit_vector
 from jaxslam.core.types import JUNCTION, Array
 from jaxslam.frontend.circle_fitting import FittedCircles, fit_circles
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
-from jaxslam.frontend.lidar import beam_ends, in_free_view
+from jaxslam.frontend.lidar import beam_ends, in_free_view, is_free_view
 from jaxslam.frontend.pyramid import Level, largest_radius
 from jaxslam.frontend.segments import Segments
 from jaxslam.frontend.tangent_circles import (
@@ -77,9 +76,10 @@ def _seen_fraction(lidar: Lidar, centre: Array, radius: Array, scan: Scan) -> tu
     """
     turn = jnp.linspace(-jnp.pi, jnp.pi, 24, endpoint=False, dtype=scan.ranges.dtype)
     rings = jnp.array([0.3, 0.6, 0.8, 0.95], turn.dtype)  # fractions of the radius, and weights
-    offset = rings[:, None, None] * unit_vector(turn)[None]
-    samples = centre[:, None, None] + radius[:, None, None, None] * offset[None]
-    seen = in_free_view(lidar, samples, scan.ranges)  # (C, 4, 24)
+    offset = radius[:, None] * rings[None]  # (C, 4)
+    x = centre[:, :1, None] + offset[:, :, None] * jnp.cos(turn)[None, None]  # (C, 4, 24)
+    y = centre[:, 1:, None] + offset[:, :, None] * jnp.sin(turn)[None, None]
+    seen = is_free_view(lidar, x, y, scan.ranges)
     area = jnp.sum(seen.mean(axis=2, dtype=rings.dtype) * rings[None], axis=1) / jnp.sum(rings)
     return area, jnp.all(seen[:, -1], axis=1)
 
@@ -99,8 +99,9 @@ def _best_apart(score: Array, xy: Array, min_distance: float, count: int) -> tup
         Index (count,) of the points, best first, and whether there is one: (count,) bool.
     """
     order = jnp.argsort(-score, stable=True)
-    xy, good = xy[order], score[order] > 0.0
-    gap = jnp.linalg.norm(xy[:, None] - xy[None], axis=2)
+    x, y, good = xy[order, 0], xy[order, 1], score[order] > 0.0
+    dx, dy = x[:, None] - x[None], y[:, None] - y[None]
+    gap = jnp.sqrt(dx * dx + dy * dy)
     better = jnp.tril(jnp.ones(gap.shape, bool), -1)
     good &= ~jnp.any(better & good[None, :] & (gap < min_distance), axis=1)
     best = jnp.argsort(~good, stable=True)[:count]

@@ -111,7 +111,7 @@ def junction_cells(
     return cells
 
 
-def _grow(
+def grow(
     config: FrontendConfig, level: Level, scan: Scan, segments: Segments
 ) -> tuple[LevelDiagram, EncodedDiagram]:
     """The diagram of one level, as sets of labels and in the encoding of the automaton."""
@@ -153,7 +153,7 @@ def extract_levels(config: FrontendConfig, scan: Scan) -> tuple[Features, tuple[
     lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
     levels = config.pyramid()
     segments = segmentation.find_segments(lidar, config.segments, scan)
-    grown = [_grow(config._replace(lidar=lidar), level, scan, segments) for level in levels]
+    grown = [grow(config._replace(lidar=lidar), level, scan, segments) for level in levels]
     cells = junction_cells(levels, [own for _, own in grown], [found.sources for found, _ in grown])
     features = concatenate_features(
         junctions.find_junctions(lidar, levels, config.features, cells, scan, segments),

@@ -18,7 +18,7 @@ from jaxslam.core.batching import map_batches
 from jaxslam.core.features import Features
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import inverse_transform, unit_vector
-from jaxslam.core.types import JUNCTION, Array
+from jaxslam.core.types import FAR_JUNCTION, JUNCTION, Array
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import in_free_view, to_scan
@@ -100,7 +100,7 @@ def measure(
     """Compare what the front end finds in scans [T] with true circles (T, N, 3), map frame."""
     run = partial(map_batches, partial(extract.extract_features, config), batch_size=16)
     found: Features = jax.tree.map(np.asarray, jax.jit(run)(scans))
-    is_junction = found.valid & (found.kind == JUNCTION)
+    is_junction = found.valid & np.isin(found.kind, (JUNCTION, FAR_JUNCTION))
     local = np.asarray(jax.vmap(inverse_transform)(pose, true[:, :, :2]))
     gap = np.linalg.norm(found.xy[:, None] - local[:, :, None], axis=-1)  # (T, N, M)
     gap = np.where(is_junction[:, None] & (np.asarray(true)[:, :, 2:] > 0.0), gap, np.inf)
@@ -109,7 +109,7 @@ def measure(
     rows, columns = np.nonzero(own)
     cov = found.cov[rows, index[own]]
     offset = found.xy[rows, index[own]] - local[rows, columns]
-    nees = np.einsum("ni,nij,nj->n", offset, np.linalg.inv(cov), offset) / 2 if len(cov) else [0.0]
+    nees = np.einsum("ni,nij,nj->n", offset, np.linalg.inv(cov), offset) / 2
     false = is_junction & (gap.min(axis=1) >= MATCH)
     return {
         "visible": int(seen.sum()),
@@ -117,7 +117,7 @@ def measure(
         "trusted": float(found.trusted[rows, index[own]].sum() / seen.sum()),
         "error_median_m": float(np.median(error[own])) if own.any() else None,
         "error_90_percent_m": float(np.quantile(error[own], 0.9)) if own.any() else None,
-        "nees_per_dof": float(np.mean(nees)),
+        "nees_per_dof_median": float(np.median(nees)) if len(nees) else None,
         "others_per_scan": float(false.sum() / len(false)),
         "others_trusted_per_scan": float((false & found.trusted).sum() / len(false)),
     }

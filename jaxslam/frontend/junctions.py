@@ -16,7 +16,7 @@ from jax import lax
 
 from jaxslam.core.features import Features, zero_padding
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import JUNCTION, Array
+from jaxslam.core.types import FAR_JUNCTION, JUNCTION, Array
 from jaxslam.frontend.circle_fitting import FittedCircles, fit_circles
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
@@ -281,8 +281,8 @@ def find_junctions(
         segments: Its straight segments.
 
     Returns:
-        `spec.max_junctions` features of kind `JUNCTION`, the finest level first, of each level
-        trusted ones first; robot frame.
+        `spec.max_junctions` features, those of the finest level first, of kind `JUNCTION`, then
+        those of coarser ones, `FAR_JUNCTION`; of each level trusted ones first; robot frame.
     """
     dtype = scan.ranges.dtype
     tangent, found, of_level = _circles_of_levels(
@@ -309,9 +309,10 @@ def find_junctions(
     score = jnp.where(good, rank, 0.0).astype(dtype)
     best, good = _best_apart(score, circle.centre, spec.min_separation, spec.max_junctions)
     zero = jnp.zeros(spec.max_junctions, dtype)
+    far = good & jnp.asarray(of_level > 0)[best]
     return zero_padding(
         Features(
-            kind=jnp.full(spec.max_junctions, JUNCTION, jnp.int32),
+            kind=jnp.where(far, jnp.int32(FAR_JUNCTION), jnp.int32(JUNCTION)),
             xy=circle.centre[best],
             cov=circle.cov[best],
             direction=zero,

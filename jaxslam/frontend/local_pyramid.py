@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxslam.core.features import Features
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import Array
+from jaxslam.core.types import FAR_JUNCTION, Array
 from jaxslam.frontend.automaton import Diagram
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.local_graph import (
@@ -71,13 +71,22 @@ def find_pyramid_arcs(
         far &= radius > largest_radius(x, y, finer, level)
         wanted = CoarseOnly(beyond_finer(diagrams[k][0].arrival, level, finer), far)
         added = find_local_arcs(lidar, level.grid, spec, features, *diagrams[k], scan, wanted)
-        arcs = _add(arcs, added, level)
+        arcs = _add(arcs, added, level, features.kind == FAR_JUNCTION)
     return arcs
 
 
-def _add(arcs: LocalArcs, added: LocalArcs, level: Level) -> LocalArcs:
-    """The arcs and frontiers of the finer levels, and those that a coarser level adds."""
-    arcs = arcs._replace(valid=arcs.valid & ~_continued(arcs, added, level))
+def _add(arcs: LocalArcs, added: LocalArcs, level: Level, is_far: Array) -> LocalArcs:
+    """The arcs and frontiers of the finer levels, and those that a coarser level adds.
+
+    Args:
+        arcs: Those of the finer levels.
+        added: Those of the coarser level.
+        level: That level.
+        is_far: (M,) bool, features that are far junctions.
+    """
+    to_far = jnp.any((added.pair >= 0) & is_far[added.pair], axis=1)
+    longer = added._replace(valid=added.valid & ~to_far)
+    arcs = arcs._replace(valid=arcs.valid & ~_continued(arcs, longer, level))
     both = jax.tree.map(lambda *x: jnp.concatenate(x), arcs, added)
     coarse = np.arange(len(both.valid))[:, None] >= len(arcs.valid)
     apart = np.where(coarse, SAME_ARC_DISTANCE * level.scale, SAME_ARC_DISTANCE)

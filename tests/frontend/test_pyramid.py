@@ -9,8 +9,11 @@ import pytest
 
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import transform
-from jaxslam.core.types import JUNCTION
+from jaxslam.core.types import FAR_JUNCTION, JUNCTION
+from jaxslam.filtering.config import FilterConfig
 from jaxslam.frontend import extract, pyramid
+from jaxslam.frontend import junctions as junction_search
+from jaxslam.frontend.circle_fitting import FittedCircles
 from jaxslam.frontend.config import COARSE_LEVEL, FrontendConfig
 from jaxslam.frontend.grid import GridSpec
 from jaxslam.frontend.pyramid import Level, largest_radius, make_level
@@ -44,7 +47,7 @@ def scan_of(walls, pose, lidar=LIDAR):
 def junctions(config, walls, pose):
     """Position in the map frame and clearance (N, 3) of the valid junctions."""
     found, _ = local_graph(config, scan_of(walls, pose, config.lidar))
-    own = np.asarray(found.valid & (found.kind == JUNCTION))
+    own = np.asarray(found.valid) & np.isin(found.kind, (JUNCTION, FAR_JUNCTION))
     xy = np.asarray(transform(jnp.asarray(pose), found.xy))
     return np.column_stack([xy, found.descriptor])[own]
 
@@ -123,11 +126,47 @@ def test_an_arc_goes_on_beyond_the_fine_grid():
     np.testing.assert_allclose(line[[0, -1]], ends, atol=1e-9)
     assert np.all(np.diff(line[:, 0]) > 0) and np.abs(line[:, 1]).max() < 0.5
     np.testing.assert_allclose(arcs.length[joined], 8.5, atol=0.5)
-    # The frontier at the edge of the fine grid, which it continues, is gone.
-    for each, count in ((fine_arcs, 1), (arcs, 0)):
-        end = np.asarray(transform(jnp.asarray(IN_CORRIDOR), each.polyline[:, -1]))
-        frontier = np.asarray(each.valid) & (np.asarray(each.pair)[:, 1] < 0)
-        assert np.sum(frontier & (end[:, 0] > 7.5)) == count
+    # The far junction is no landmark: for a map of landmarks the branch is still a frontier.
+    assert found.kind[:3].tolist() == [JUNCTION, FAR_JUNCTION, JUNCTION]
+    assert len(frontiers_ahead(fine_arcs)) == len(frontiers_ahead(arcs)) == 1
+
+
+def frontiers_ahead(arcs):
+    """Frontiers from 7 m ahead on."""
+    own = np.asarray(arcs.valid) & (np.asarray(arcs.pair)[:, 1] < 0)
+    return np.flatnonzero(own & (np.asarray(arcs.polyline)[:, -1, 0] > 7.0))
+
+
+def test_a_frontier_is_where_the_view_ends_not_the_grid():
+    walls = worlds.outline([(-2.0, -2.0, 60.0, 2.0), (2.0, 2.0, 5.0, 6.0)])
+    scan = scan_of(walls, IN_CORRIDOR)
+    (_, one), (_, two) = local_graph(ONE, scan), local_graph(TWO, scan)
+    (k,), (n,) = frontiers_ahead(one), frontiers_ahead(two)
+    assert one.polyline[k, -1, 0] < 8.0 and two.polyline[n, -1, 0] > 20.0
+    assert one.pair[k].tolist() == two.pair[n].tolist() == [0, -1]
+
+
+def test_the_filter_leaves_far_junctions_out():
+    found, _ = local_graph(TWO, scan_of(HALL, IN_HALL))
+    assert found.kind[0] == FAR_JUNCTION and found.valid[0]
+    assert FAR_JUNCTION not in FilterConfig().landmark_kinds
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_circle_that_the_finer_level_holds_is_not_of_the_coarser(kept):
+    levels = TWO.pyramid()
+    circle = FittedCircles(
+        centre=jnp.array([[4.0, 1.0], [4.0, 1.0], [7.0, 0.0]]),
+        radius=jnp.array([2.0, 4.0, 2.0]),
+        cov=None,
+        penetration=None,
+        touched=None,
+        feet_real=None,
+        hidden_depth=None,
+    )
+    of_level = np.zeros(3, int) if kept else np.ones(3, int)
+    want = [True, True, True] if kept else [False, True, True]
+    assert junction_search._not_of_finer(circle, levels, of_level).tolist() == want
 
 
 def test_edge_codes_have_one_level():

@@ -16,7 +16,7 @@ COARSE_LEVEL = GridSpec(cell_size=0.4, x_max=25.6, x_min=-0.4, y_half=25.6)
 
 PYRAMID = (COARSE_LEVEL,)
 """Levels for halls and scanners of long range, `FrontendConfig(levels=PYRAMID)`; the local map
-takes about 1.35 times as long."""
+takes about 1.55 times as long."""
 
 LABELS = ("segments", "codes")
 """Known sources of the Voronoi diagram, for `FrontendConfig.labels`."""

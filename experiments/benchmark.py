@@ -29,8 +29,6 @@ from jaxslam.frontend import (
     features,
     junctions,
     segmentation,
-    segments,
-    voronoi,
 )
 from jaxslam.frontend.automaton import EncodedDiagram
 from jaxslam.frontend.config import FrontendConfig
@@ -92,24 +90,29 @@ def stages(config: FrontendConfig, scans: Scan) -> dict[str, tuple]:
     Returns:
         For each stage its function for all scans, and the arguments.
     """
-    lidar, grid, spec = config.lidar, config.grid, config.features
+    lidar, spec, levels = config.lidar, config.features, config.pyramid()
 
-    def source_cells(scan: Scan, found: Segments) -> tuple[jax.Array, jax.Array]:
-        own = segments.segment_cells(lidar, grid, scan, found)
-        return own, extract.encode_segments(own, seen_free(lidar, grid, scan))
+    def source_cells(scan: Scan, found: Segments) -> tuple[list[jax.Array], list[jax.Array]]:
+        own = [extract.level_segments(lidar, level, scan, found) for level in levels]
+        free = [seen_free(lidar, level.grid, scan) for level in levels]
+        return own, [extract.encode_segments(*cells) for cells in zip(own, free, strict=True)]
+
+    def expand_levels(start: list[jax.Array]) -> list[EncodedDiagram]:
+        steps = config.automaton_steps
+        return [automaton.expand_encoded(cells, steps=steps, octagon=True) for cells in start]
 
     def find_junctions(
-        own: jax.Array, diagram: EncodedDiagram, scan: Scan, found: Segments
+        own: list[jax.Array], diagrams: list[EncodedDiagram], scan: Scan, found: Segments
     ) -> Features:
-        cells = voronoi.encoded_junction_cells(diagram, own >= 0)
-        return junctions.find_junctions(lidar, grid, spec, cells, scan, found)
+        cells = extract.junction_cells(levels, diagrams, [segment >= 0 for segment in own])
+        return junctions.find_junctions(lidar, levels, spec, cells, scan, found)
 
     def find_others(found: Segments) -> tuple[Features, Features]:
         return features.find_corners(spec, found), features.find_wall_directions(spec, found)
 
     find_segments = batched(partial(segmentation.find_segments, lidar, config.segments))
     cells_of = batched(source_cells)
-    expand = batched(partial(automaton.expand_encoded, steps=config.automaton_steps, octagon=True))
+    expand = batched(expand_levels)
     found = find_segments(scans)
     own, start = cells_of(scans, found)
     return {

@@ -12,7 +12,8 @@ class Features(NamedTuple):
     """Features of one scan, of all three kinds, padded to M; robot frame.
 
     Attributes:
-        kind: (M,) int32, `JUNCTION`, `CORNER` or `WALL`.
+        kind: (M,) int32, `JUNCTION`, `CORNER` or `WALL`, the kinds of landmarks, or
+            `FAR_JUNCTION`, which is an end of arcs only.
         xy: (M, 2) [m] position; zero for a wall direction.
         cov: (M, 2, 2) [m^2] covariance of the position.
         direction: (M,) [rad] of a corner: bisector of its free side; of a wall: of its line, in

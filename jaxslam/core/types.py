@@ -38,6 +38,9 @@ Key = jax.Array
 JUNCTION, CORNER, WALL = 0, 1, 2
 """Kinds of landmarks: junction of the Voronoi diagram, corner of two walls, wall direction."""
 
+FAR_JUNCTION = 3
+"""Kind of a feature that is no landmark: a junction that a coarser grid of the scan holds."""
+
 
 def check_type(name: str, x: Any, wanted: type, *, advice: str = "") -> None:
     """Raise ValueError unless an argument is a record of this type.

@@ -32,6 +32,8 @@ class FeatureSpec(NamedTuple):
             difference of the turn from pi.
         tangency_gate: A wall touches the circle of a junction if it is within so many standard
             deviations of it.
+        max_coarse_candidates: Number of cells of each coarser level of the pyramid at which
+            junctions are searched.
     """
 
     max_junctions: int = 8
@@ -48,10 +50,11 @@ class FeatureSpec(NamedTuple):
     min_corner_length: float = 0.12
     min_corner_angle: float = 0.6
     tangency_gate: float = 1.5
+    max_coarse_candidates: int = 8
 
     @property
     def num_candidates(self) -> int:
-        """Number of cells at which junctions are searched: three for each."""
+        """Number of cells of the finest level at which junctions are searched: three for each."""
         return 3 * self.max_junctions
 
     @property
@@ -64,7 +67,7 @@ def check_feature_spec(spec: FeatureSpec) -> None:
     """Raise ValueError, naming the field, unless capacities of features are possible."""
     if not isinstance(spec, FeatureSpec):
         raise ValueError(f"features is a {type(spec).__name__}, not a FeatureSpec")
-    for name in ("max_junctions", "max_corners", "max_walls"):
+    for name in ("max_junctions", "max_corners", "max_walls", "max_coarse_candidates"):
         if getattr(spec, name) < 0:
             raise ValueError(f"features.{name} is {getattr(spec, name)}, not 0 or more")
 

@@ -41,11 +41,17 @@ def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
     Returns:
         (...) bool.
     """
-    beam = (jnp.arctan2(points[..., 1], points[..., 0]) - lidar.angle_min) / lidar.angle_increment
+    return is_free_view(lidar, points[..., 0], points[..., 1], ranges)
+
+
+def is_free_view(lidar: Lidar, x: Array, y: Array, ranges: Array) -> Array:
+    """`in_free_view` of points with coordinates x and y (...) [m], robot frame."""
+    beam = (jnp.arctan2(y, x) - lidar.angle_min) / lidar.angle_increment
     beam = jnp.where(beam < -0.5, beam + 2 * jnp.pi / lidar.angle_increment, beam)
     low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.num_beams - 2)
     within = (beam > -0.5) & (beam < lidar.num_beams - 0.5)
-    return within & (jnp.linalg.norm(points, axis=-1) < jnp.minimum(ranges[low], ranges[low + 1]))
+    nearer = jnp.minimum(ranges[:-1], ranges[1:])
+    return within & (jnp.sqrt(x * x + y * y) < nearer[low])
 
 
 def begin_behind(lidar: Lidar, scan: Scan) -> tuple[Lidar, Scan]:

@@ -25,7 +25,7 @@ from jax import lax
 from jaxslam.core.batching import sequential_vmap_on_cpu
 from jaxslam.core.features import Features
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import Array, check_array
+from jaxslam.core.types import AnyArray, Array, check_array
 from jaxslam.frontend import automaton
 from jaxslam.frontend.arc_tracing import measure_arc, trace_back
 from jaxslam.frontend.automaton import Diagram, single_labels
@@ -61,26 +61,41 @@ class LocalArcs(NamedTuple):
     valid: Array
 
 
+class CoarseOnly(NamedTuple):
+    """What a coarser level of the pyramid adds to the local map.
+
+    Attributes:
+        cells: (H, W) bool, cells whose largest empty circle the finer levels cannot hold.
+        junctions: (N,) bool, junctions whose circle they cannot hold.
+    """
+
+    cells: Array
+    junctions: Array
+
+
 def polyline_gap(one: Array, other: Array) -> Array:
     """Largest distance (...) [m] between two polylines (..., K, 2), point by point."""
     return jnp.max(jnp.linalg.norm(one - other, axis=-1), axis=-1)
 
 
-def repeats_earlier(pair: Array, line: Array, valid: Array) -> Array:
+def repeats_earlier(
+    pair: Array, line: Array, valid: Array, distance: AnyArray | float = SAME_ARC_DISTANCE
+) -> Array:
     """Whether arcs are duplicates of an earlier one.
 
-    They have the same ends and are nowhere `SAME_ARC_DISTANCE` apart.
+    They have the same ends and are nowhere `distance` apart.
 
     Args:
         pair: (P, 2) int32 ends.
         line: (P, K, 2) [m] polylines.
         valid: (P,) bool.
+        distance: (P, 1) or () [m].
 
     Returns:
         (P,) bool.
     """
     same = jnp.all(pair[:, None] == pair[None], axis=2) & (
-        polyline_gap(line[:, None], line[None]) < SAME_ARC_DISTANCE
+        polyline_gap(line[:, None], line[None]) < distance
     )
     earlier = jnp.tril(jnp.ones(same.shape, bool), -1)
     return jnp.any(same & earlier & valid[None], axis=1)
@@ -172,6 +187,7 @@ def find_local_arcs(
     diagram: Diagram,
     sources: Array,
     scan: Scan,
+    coarse: CoarseOnly | None = None,
 ) -> LocalArcs:
     """Which junctions the branches of a diagram join, and which branches leave the visible region.
 
@@ -187,6 +203,8 @@ def find_local_arcs(
         diagram: Its Voronoi diagram.
         sources: (H, W) bool, the cells that fronts started from.
         scan: The scan.
+        coarse: For a coarser level of the pyramid: what the finer ones do not hold, and nothing
+            else is wanted.
 
     Returns:
         `MAX_LOCAL_ARCS` arcs, then `MAX_LOCAL_FRONTIERS` frontiers; robot frame.
@@ -199,13 +217,23 @@ def find_local_arcs(
     xy = jnp.where(valid[:, None], xy, 0.0)
     bit = id_bits(spec.max_junctions)
     seeds = seed_cells(xy, valid, bit, grid)
+    if coarse is not None:  # cells of the other side of a wall may be within 2.5 cells
+        seeds = jnp.where((diagram.labels != 0) & ~sources, seeds, jnp.zeros_like(seeds))
     ids = sequential_vmap_on_cpu(propagate_ids)(seeds, diagram, sources)
     free = sequential_vmap_on_cpu(lambda scan: seen_free(lidar, grid, scan))(scan)
     unseen = (diagram.labels == 0) & ~sources & ~free
     # The step of arrival is at most the distance to the nearest wall in cells.
     wide = diagram.arrival > round(spec.min_clearance / grid.cell_size)
     apart = round(SAME_ARC_DISTANCE / grid.cell_size)
-    ends = [_meeting_cells(ids, xy, grid, bit, apart), _end_cells(ids, unseen, wide, bit, apart)]
+    met = _meeting_ids(ids.ids)
+    meets = (met & (met - 1)) != 0
+    if coarse is not None:
+        far_ids = jnp.bitwise_or.reduce(jnp.where(coarse.junctions, bit[:-1], 0))
+        wide, meets = wide & coarse.cells, meets & (coarse.cells | ((met & far_ids) != 0))
+    ends = [
+        _meeting_cells(ids, met, meets, xy, grid, bit, apart),
+        _end_cells(ids, unseen, wide, bit, apart),
+    ]
     pair, cell, good = (jnp.concatenate(x) for x in zip(*ends, strict=True))
     hits = jnp.where(scan.hit[:, None], beam_ends(lidar, scan), 1e3)
     line, length, clearance = jax.vmap(measure_arc, in_axes=(0, 0, 0, None, None, None))(
@@ -231,19 +259,33 @@ def _meeting_ids(ids: Array) -> Array:
 
 
 def _meeting_cells(
-    ids: PropagatedIds, xy: Array, grid: GridSpec, bit: Array, min_distance: int
+    ids: PropagatedIds,
+    meeting: Array,
+    meets: Array,
+    xy: Array,
+    grid: GridSpec,
+    bit: Array,
+    min_distance: int,
 ) -> tuple[Array, Array, Array]:
     """Where two ids meet first; each pair in two cells at most, `min_distance` cells apart.
 
     Of the cells that hold both ids of a pair those with the earliest step are taken, which a cell
     off the branch is 2.5 steps behind; the distances to both junctions break ties.
 
+    Args:
+        ids: Ids and steps of all cells.
+        meeting: (H, W) bit sets of `_meeting_ids`.
+        meets: (H, W) bool, the cells that count; they hold two ids or more.
+        xy: (N, 2) [m] of the junctions.
+        grid: The grid.
+        bit: (N + 1,) bit of each id.
+        min_distance: [cells]
+
     Returns:
         Pairs (P, 2) of ids, cells (P,) and whether there is one (P,) bool, P = `MAX_LOCAL_ARCS`.
     """
-    meeting = _meeting_ids(ids.ids)
     # Few cells hold two ids: all that follows is computed for these only.
-    cells = _marked((meeting & (meeting - 1)) != 0)
+    cells = _marked(meets)
 
     def take(image: Array) -> Array:
         return image.reshape(-1).at[cells].get(mode="fill", fill_value=0)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from jaxslam.core.batching import sequential_vmap_on_cpu
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import dot
 from jaxslam.core.types import Array
@@ -90,6 +91,9 @@ class SegmentSpec(NamedTuple):
     corner_tolerance: float = 0.15
 
 
+POINTS_PER_GAP = 6
+"""Points drawn from each hit to the next of the same segment, on cells of 10 cm."""
+
 MAX_SEGMENTS = 64
 """Most segments of a scan."""
 
@@ -118,7 +122,12 @@ def segment_bits(segment: Array) -> Array:
 
 
 def segment_cells(
-    lidar: Lidar, spec: GridSpec, scan: Scan, segments: Segments, *, points_per_gap: int = 6
+    lidar: Lidar,
+    spec: GridSpec,
+    scan: Scan,
+    segments: Segments,
+    *,
+    points_per_gap: int = POINTS_PER_GAP,
 ) -> Array:
     """Segment (H, W) int8 that each cell lies on, -1 for none; drawn without gaps from hit to hit.
 
@@ -143,6 +152,13 @@ def segment_cells(
     drawn = xy[:, None] + fraction[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
     drawn = jnp.where((of_beam < capacity)[:, None, None], drawn, jnp.inf)
     index = cell_of(spec, drawn.reshape(-1, 2))
-    cells = jnp.full(spec.shape, -1, jnp.int8)
+    # One index for a cell, the last for what is outside: faster than two indices.
+    size = spec.shape[0] * spec.shape[1]
+    cell = jnp.where(index[:, 0] < spec.shape[0], index[:, 0] * spec.shape[1] + index[:, 1], size)
     values = jnp.repeat(of_beam, points_per_gap).astype(jnp.int8)
-    return cells.at[index[:, 0], index[:, 1]].max(values, mode="drop")
+
+    def draw(cell: Array, values: Array) -> Array:
+        blank = jnp.full(size + 1, -1, jnp.int8)
+        return blank.at[cell].max(values, mode="promise_in_bounds")
+
+    return sequential_vmap_on_cpu(draw)(cell, values)[:-1].reshape(spec.shape)

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam.core.se2 import dot
-from jaxslam.core.types import Array
+from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.segments import Segments
 
 MAX_FOOT_COSINE = 0.95
@@ -152,7 +152,9 @@ def nearest_three_walls(foot: FootPoints, max_cosine: float) -> Array:
     return jnp.stack([first, second, third])
 
 
-def _newton(x: Array, y: Array, three: WallSegments) -> tuple[Array, Array, FootPoints]:
+def _newton(
+    x: Array, y: Array, three: WallSegments, max_step: AnyArray | float
+) -> tuple[Array, Array, FootPoints]:
     """Solve d_0 = d_1 = d_2 for the centre by four steps of Newton's method.
 
     Moving the centre by (u, v) changes distance k to d_k - t_k . (u, v), to first order. All three
@@ -161,13 +163,13 @@ def _newton(x: Array, y: Array, three: WallSegments) -> tuple[Array, Array, Foot
         (t_1 - t_0) . (u, v) = d_1 - d_0
         (t_2 - t_0) . (u, v) = d_2 - d_0
 
-    which Cramer's rule solves. The determinant is kept away from zero, and each component of a
-    step within 0.4 m.
+    which Cramer's rule solves. The determinant is kept away from zero.
 
     Args:
         x: (C,) [m] initial centre, robot frame.
         y: (C,) [m] initial centre, robot frame.
         three: (3, C) the walls.
+        max_step: (C,) or () [m] largest size of each component of a step.
 
     Returns:
         Centres x and y (C,), and the feet (3, C) of the walls there.
@@ -178,8 +180,8 @@ def _newton(x: Array, y: Array, three: WallSegments) -> tuple[Array, Array, Foot
         ax, ay, gap = tx[1:] - tx[:1], ty[1:] - ty[:1], d[1:] - d[:1]  # rows 1 and 2: (2, C)
         determinant = ax[0] * ay[1] - ax[1] * ay[0]
         determinant = jnp.where(jnp.abs(determinant) > 1e-4, determinant, 1e-4)
-        x = x + jnp.clip((gap[0] * ay[1] - gap[1] * ay[0]) / determinant, -0.4, 0.4)
-        y = y + jnp.clip((ax[0] * gap[1] - ax[1] * gap[0]) / determinant, -0.4, 0.4)
+        x = x + jnp.clip((gap[0] * ay[1] - gap[1] * ay[0]) / determinant, -max_step, max_step)
+        y = y + jnp.clip((ax[0] * gap[1] - ax[1] * gap[0]) / determinant, -max_step, max_step)
         foot = foot_points(x, y, three)
     return x, y, foot
 
@@ -189,25 +191,24 @@ def one_of(three: Array, index: Array) -> Array:
     return (index == three[:1]) | (index == three[1:2]) | (index == three[2:])
 
 
-def _most_similar(cosines: list[Array], wall: Array, index: Array) -> Array:
-    """Which of the three walls, 0..2 (C,), has its foot in a direction most like that of `wall`.
-
-    Args:
-        cosines: Three of (K, C), of the angles between every foot and that of one of the three.
-        wall: (C,) index of a wall.
-        index: (K, 1) row numbers.
-    """
-    is_wall = index == wall[None]
-    cosine = [jnp.sum(jnp.where(is_wall, every, 0.0), axis=0) for every in cosines]
-    return nearest_wall(-jnp.stack(cosine))
+_Circle = tuple[Array, Array, Array]
+"""Centres x and y (C,) and walls (3, C)."""
 
 
-_Carry = tuple[tuple[Array, Array, Array], TangentCircles]
-"""Centres x and y (C,) and walls (3, C) to go on with, and the last solution."""
+def _of_wall(toward: tuple[Array, Array], is_wall: Array) -> tuple[Array, Array]:
+    """Direction ((C,), (C,)) to the foot of one wall for each circle, `is_wall` (K, C)."""
+    tx, ty = (jnp.sum(jnp.where(is_wall, t, 0.0), axis=0) for t in toward)
+    return tx, ty
 
 
 def tangent_circles(
-    x: Array, y: Array, three: Array, walls: WallSegments, *, swaps: int
+    x: Array,
+    y: Array,
+    three: Array,
+    walls: WallSegments,
+    *,
+    swaps: int,
+    max_step: AnyArray | float = 0.4,
 ) -> TangentCircles:
     """Circles near x, y that touch three walls and that no wall cuts.
 
@@ -215,16 +216,17 @@ def tangent_circles(
     the most similar direction, that is, the wall that it stands in front of. Below, j cuts into the
     circle and replaces wall 2, since t_j . t_2 is larger than t_j . t_0 and t_j . t_1:
 
-            -------+-------               repeat `swaps` + 1 times:
+            -------+-------               repeat `swaps` times:
         |          f0         |  wall 2       solve for the circle tangent to the three (`_newton`)
         |              |      |               j = the nearest other wall
      f1 +          c   + fj   + f2            penetration = radius - d_j
         |              |      |               if penetration > 1 mm:
      wall 1          wall j                       j replaces the wall k of largest t_j . t_k
+                                          solve once more
 
     The *fourth* wall is the nearest other one whose foot is in none of the three directions (all
     cosines below `MAX_FOOT_COSINE`). Three junctions may lie close by: those in which it replaces
-    one of the three walls. `junctions.find_junctions` searches these.
+    one of the three walls. `circle_search` searches these.
 
     Args:
         x: (C,) [m] initial centre, robot frame.
@@ -232,39 +234,46 @@ def tangent_circles(
         three: (3, C) int32 index of the walls to start with.
         walls: (K, 1) all walls.
         swaps: How many times a wall may be replaced.
+        max_step: (C,) or () [m] largest size of each component of a step of Newton's method.
 
     Returns:
         The C circles, with `penetration` and `fourth_wall` of the last solution.
     """
     index = jnp.arange(len(walls.length), dtype=jnp.int32)[:, None]
 
-    def solve_and_swap(
-        x: Array, y: Array, three: Array
-    ) -> tuple[tuple[Array, Array, Array], TangentCircles]:
-        x, y, own = _newton(x, y, walls.of(three))
+    def solve(x: Array, y: Array, three: Array) -> tuple[Array, Array, FootPoints, FootPoints]:
+        """Centres, feet (3, C) of the three walls, and those (K, C) of all, the three at `inf`."""
+        x, y, own = _newton(x, y, walls.of(three), max_step)
         every = foot_points(x, y, walls)
-        radius = jnp.mean(own.distance, axis=0)
-        others = jnp.where(one_of(three, index), jnp.inf, every.distance)  # (K, C)
-        intruder, penetration = nearest_wall(others), radius - jnp.min(others, axis=0)
-        (tx, ty), (own_tx, own_ty) = every.toward, own.toward
-        cosines = [tx * own_tx[k][None] + ty * own_ty[k][None] for k in range(3)]
-        replaced = _most_similar(cosines, intruder, index)
+        others = jnp.where(one_of(three, index), jnp.inf, every.distance)
+        return x, y, own, every._replace(distance=others)
+
+    def solve_and_swap(circle: _Circle, _: None) -> tuple[_Circle, None]:
+        x, y, three = circle
+        x, y, own, others = solve(x, y, three)
+        intruder = nearest_wall(others.distance)
+        penetration = jnp.mean(own.distance, axis=0) - jnp.min(others.distance, axis=0)
+        tx, ty = _of_wall(others.toward, index == intruder[None])
+        own_tx, own_ty = own.toward
+        replaced = nearest_wall(-(tx[None] * own_tx + ty[None] * own_ty))
         replaces = jnp.arange(3, dtype=jnp.int32)[:, None] == replaced[None]  # (3, C)
         replaces &= (penetration > 1e-3)[None]
-        largest = jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2])
-        fourth = nearest_wall(jnp.where(largest < MAX_FOOT_COSINE, others, jnp.inf))
-        between = [
-            own_tx[i] * own_tx[j] + own_ty[i] * own_ty[j] for i, j in ((0, 1), (1, 2), (2, 0))
-        ]
-        cosine = jnp.maximum(jnp.maximum(between[0], between[1]), between[2])
-        solved = TangentCircles(x, y, radius, three, penetration, cosine, fourth)
-        return (x, y, jnp.where(replaces, intruder[None], three)), solved
+        return (x, y, jnp.where(replaces, intruder[None], three)), None
 
-    def body(carry: _Carry, _: None) -> tuple[_Carry, None]:
-        return solve_and_swap(*carry[0]), None
-
-    zero = jnp.zeros_like(x)
-    unsolved = TangentCircles(x, y, zero, three, zero, zero, jnp.zeros_like(three[0]))
-    (_, last), _ = lax.scan(body, ((x, y, three), unsolved), length=swaps + 1)
-    # Up to here `min_angle` holds the cosine.
-    return last._replace(min_angle=jnp.arccos(jnp.clip(last.min_angle, -0.9999, 0.9999)))
+    (x, y, three), _ = lax.scan(solve_and_swap, (x, y, three), length=swaps)
+    x, y, own, others = solve(x, y, three)
+    (tx, ty), (own_tx, own_ty) = others.toward, own.toward
+    cosines = [tx * own_tx[k][None] + ty * own_ty[k][None] for k in range(3)]
+    largest = jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2])
+    between = [own_tx[i] * own_tx[j] + own_ty[i] * own_ty[j] for i, j in ((0, 1), (1, 2), (2, 0))]
+    cosine = jnp.maximum(jnp.maximum(between[0], between[1]), between[2])
+    radius = jnp.mean(own.distance, axis=0)
+    return TangentCircles(
+        x=x,
+        y=y,
+        radius=radius,
+        walls=three,
+        penetration=radius - jnp.min(others.distance, axis=0),
+        min_angle=jnp.arccos(jnp.clip(cosine, -0.9999, 0.9999)),
+        fourth_wall=nearest_wall(jnp.where(largest < MAX_FOOT_COSINE, others.distance, jnp.inf)),
+    )

@@ -69,7 +69,7 @@ def test_the_stages_are_those_of_the_front_end():
     scans = Scan(jnp.full((2, 361), 3.0), jnp.ones((2, 361), bool))
     calls = benchmark.stages(config, scans)
     (start,) = calls["automaton"][1:]
-    assert start.shape == (2, *config.grid.shape)
+    assert [cells.shape for cells in start] == [(2, *x.grid.shape) for x in config.pyramid()]
 
 
 def test_the_filter_equals_filterpy_and_its_gradient_equals_differences():

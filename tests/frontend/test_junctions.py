@@ -6,7 +6,7 @@ from rooms import CENTRE, IN_TRIANGLE, TRIANGLE
 
 from jaxslam.core.se2 import inverse_transform
 from jaxslam.core.types import JUNCTION
-from jaxslam.frontend import automaton, junctions, segmentation
+from jaxslam.frontend import automaton, circle_search, junctions, segmentation
 from jaxslam.frontend.grid import cell_of, centre_of
 from jaxslam.frontend.lidar import beam_angles, beam_ends
 from jaxslam.frontend.segments import LABEL_BITS, segment_bits
@@ -17,6 +17,7 @@ from jaxslam.simulation.worlds import World
 
 CONFIG = Config().frontend
 LIDAR, GRID, SPEC = CONFIG.lidar, CONFIG.grid, CONFIG.features
+LEVELS = CONFIG.pyramid()
 SCAN = ray_casting.cast(LIDAR, World(jnp.asarray(TRIANGLE)), jnp.array(IN_TRIANGLE))
 SEGMENTS = segmentation.find_segments(LIDAR, CONFIG.segments, SCAN)
 HERE = inverse_transform(jnp.array(IN_TRIANGLE), jnp.array(CENTRE))  # the junction, robot frame
@@ -35,8 +36,8 @@ def marked(*cells):
 
 def starts(cells):
     """Starts of circles from junction cells: their centres (N, 2)."""
-    x, y, _, found = junctions._starts(
-        cells, wall_segments(SEGMENTS), GRID, SPEC, SCAN.ranges.dtype
+    x, y, _, found = circle_search._starts(
+        cells, wall_segments(SEGMENTS), LEVELS[0], SPEC.num_candidates, SPEC, SCAN.ranges.dtype
     )
     return np.stack([x, y], axis=1)[np.asarray(found)]
 
@@ -54,7 +55,7 @@ def test_cells_too_near_to_walls_do_not_displace_a_junction():
     tight = (clearance < SPEC.min_clearance - 0.15) & (clearance > 0.05)
     tight &= np.hypot(*xy.T) < np.hypot(*HERE)
     cells = jnp.asarray(tight.reshape(GRID.shape)) | marked(CELL)
-    blocks = np.unique(np.argwhere(cells) // junctions.BLOCK, axis=0)
+    blocks = np.unique(np.argwhere(cells) // circle_search.BLOCK, axis=0)
     assert SPEC.num_candidates < len(blocks) < 3 * SPEC.num_candidates
     found = starts(cells)
     assert len(found) == 1 and np.hypot(*(found[0] - HERE)) < 0.3
@@ -66,7 +67,7 @@ def test_cells_too_near_to_walls_do_not_displace_a_junction():
 def test_a_step_of_a_wall_costs_a_junction_its_trust_and_a_large_one_the_junction(
     step, valid, trusted
 ):
-    clean = find(LIDAR, GRID, SPEC, marked(CELL), SCAN, SEGMENTS)
+    clean = find(LIDAR, LEVELS, SPEC, [marked(CELL)], SCAN, SEGMENTS)
     assert clean.trusted[0] and np.hypot(*(clean.xy[0] - HERE)) < 0.01
     # The beam next to a foot ends `step` inside the circle.
     centre, hits = np.asarray(clean.xy[0]), np.asarray(beam_ends(LIDAR, SCAN))
@@ -77,7 +78,7 @@ def test_a_step_of_a_wall_costs_a_junction_its_trust_and_a_large_one_the_junctio
     depth = float(clean.descriptor[0]) - np.hypot(*(ends - centre).T)
     shorter = reach[np.argmax(depth > step)]
     stepped = SCAN._replace(ranges=SCAN.ranges.at[beam].add(-shorter))
-    found = find(LIDAR, GRID, SPEC, marked(CELL), stepped, SEGMENTS)
+    found = find(LIDAR, LEVELS, SPEC, [marked(CELL)], stepped, SEGMENTS)
     assert found.valid[0] == valid and found.trusted[0] == trusted
     if valid:
         assert found.kind[0] == JUNCTION

@@ -112,6 +112,8 @@ def kept_ids(
 ) -> tuple[np.ndarray, int]:
     """Ids of nodes, those of an earlier map where they are at the same place.
 
+    So a node that was no landmark keeps its id when it becomes one.
+
     Args:
         ids: (N,) int of the nodes that are landmarks; -1 for others.
         xy: (N, 2) [m].
@@ -124,7 +126,7 @@ def kept_ids(
     ids = ids.copy()
     if previous is not None and len(previous.id):
         old = np.flatnonzero(~np.isin(previous.id, ids))
-        new = np.flatnonzero(ids < 0)
+        new = np.flatnonzero(~np.isin(ids, previous.id))
         if len(old) and len(new):
             tree = cKDTree(xy[new])
             near = tree.query_ball_point(previous.xy[old], SAME_NODE)
@@ -134,10 +136,12 @@ def kept_ids(
                 for n in members
             )
             used: set[int] = set()
+            named: set[int] = set()
             for _, k, n in pairs:
-                if ids[n] < 0 and k not in used:
+                if n not in named and k not in used:
                     ids[n] = previous.id[k]
                     used.add(k)
+                    named.add(n)
     fresh = np.flatnonzero(ids < 0)
     ids[fresh] = next_id + np.arange(len(fresh))
     return ids, next_id + len(fresh)

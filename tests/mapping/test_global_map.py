@@ -174,3 +174,12 @@ def test_no_node_takes_the_id_of_a_corner():
     assert len(np.unique(graph.id)) == len(graph.id)
     assert graph.kind[graph.id == before.graph.id[0]].tolist() == [CORNER]
     assert 4 not in graph.id  # nor does a node take that of an earlier corner
+
+
+def test_a_node_that_becomes_a_landmark_keeps_its_id():
+    before = build_global_map(drawn(*T_SHAPE), DRIVE, NOTHING, 0)
+    (junction,) = [n for n, degree in net_of(before.graph).degree() if degree == 3]
+    known = landmarks([before.graph.xy[junction] + 0.05], [1.1], [50])
+    again = build_global_map(drawn(*T_SHAPE), DRIVE, known, 60, previous=before.graph).graph
+    np.testing.assert_array_equal(np.sort(again.id), np.sort(before.graph.id))
+    np.testing.assert_array_equal(again.xy[again.id == before.graph.id[junction]], known.xy)

@@ -80,6 +80,26 @@ def refine(line: np.ndarray, spacing: float, least: int = 1) -> np.ndarray:
     return np.concatenate([points, line[-1:]])
 
 
+def simplify(line: np.ndarray, tolerance: float) -> np.ndarray:
+    """Polyline (m, 2) of fewer points, at most `tolerance` from the given one (n, 2).
+
+    A piece is split at its point furthest from the chord, as long as that is too far.
+
+    References:
+        Douglas, Peucker (1973), Algorithms for the reduction of the number of points required to
+        represent a digitized line or its caricature.
+    """
+    kept, pieces = {0, len(line) - 1}, [(0, len(line) - 1)]
+    while pieces:
+        first, last = pieces.pop()
+        distance = project(line[first + 1 : last], line[[first, last]])[0]
+        if distance.size and distance.max() > tolerance:
+            furthest = first + 1 + int(distance.argmax())
+            kept.add(furthest)
+            pieces += [(first, furthest), (furthest, last)]
+    return line[sorted(kept)]
+
+
 def project(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nearest points on a polyline.
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.core import polylines
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import Door, PlannerData, Regions
 from jaxslam.core.types import JUNCTION, as_float64
@@ -92,7 +93,7 @@ def straight_lanes(
         numbers = () if regions is None or planner is None else planner.arc_doors[arc]
         found = [] if regions is None else [regions.doors[k] for k in dict.fromkeys(numbers)]
         found = [door for door in found if has_leaf(door)]
-        line, doors = _with_doors(simplified(line, tolerance), found)
+        line, doors = _with_doors(polylines.simplify(line, tolerance), found)
         if len(line) == 2 and start == end:
             continue  # a loop within the tolerance
         more = range(len(points), len(points) + len(line) - 2)
@@ -109,28 +110,6 @@ def straight_lanes(
     if not np.isfinite(positions).all():
         raise ValueError("the map has a position that is not finite")
     return StraightLanes(tuple(names), positions, tuple(point_labels), tuple(lanes))
-
-
-def simplified(line: np.ndarray, tolerance: float) -> np.ndarray:
-    """Points (m, 2) of a polyline (n, 2) that Douglas and Peucker keep for a tolerance [m]."""
-    kept = {0, len(line) - 1}
-    open_parts = [(0, len(line) - 1)]
-    while open_parts:
-        first, last = open_parts.pop()
-        distance = _distance(line[first + 1 : last], line[first], line[last])
-        if distance.size and distance.max() > tolerance:
-            middle = first + 1 + int(distance.argmax())
-            kept.add(middle)
-            open_parts += [(first, middle), (middle, last)]
-    return line[sorted(kept)]
-
-
-def _distance(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distances (n,) [m] of points (n, 2) from the segment a b."""
-    distance: np.ndarray = np.linalg.norm(
-        points - a - _along(points, a, b)[:, None] * (b - a), axis=1
-    )
-    return distance
 
 
 def _along(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

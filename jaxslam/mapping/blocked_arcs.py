@@ -9,6 +9,7 @@ open.
 import numpy as np
 from scipy.spatial import cKDTree
 
+from jaxslam.core import polylines
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.matching.scan_agreement import moved
@@ -66,10 +67,7 @@ def blocked_arcs(
 
 def _points(line: np.ndarray) -> np.ndarray:
     """Points (N, 2) on a polyline (n, 2), `SPACING` apart or less."""
-    step = np.hypot(*np.diff(line, axis=0).T)
-    along = np.append(0.0, np.cumsum(step))
-    at = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / SPACING)) + 1)
-    return np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])
+    return polylines.resample(line, int(np.ceil(polylines.length(line) / SPACING)) + 1)
 
 
 def _look(

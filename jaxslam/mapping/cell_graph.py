@@ -156,7 +156,7 @@ def _node_cells(
 
 def make_arc(ends: tuple[int, int], cells: np.ndarray) -> CellArc:
     """Arc along a path of cells (n, 2)."""
-    line = _simplified(_smoothed(cells))
+    line = polylines.simplify(_smoothed(cells), _TOLERANCE)
     return CellArc(ends, cells, line, float(polylines.length(line)))
 
 
@@ -166,23 +166,3 @@ def _smoothed(cells: np.ndarray) -> np.ndarray:
     for _ in range(4):
         line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]
     return line
-
-
-def _simplified(line: np.ndarray) -> np.ndarray:
-    """Polyline (m, 2) of fewer points, at most `_TOLERANCE` from the given one (n, 2).
-
-    A piece is split at its point furthest from the chord, as long as that is too far.
-
-    References:
-        Douglas, Peucker (1973), Algorithms for the reduction of the number of points required to
-        represent a digitized line or its caricature.
-    """
-    kept, pieces = {0, len(line) - 1}, [(0, len(line) - 1)]
-    while pieces:
-        first, last = pieces.pop()
-        distance = polylines.project(line[first + 1 : last], line[[first, last]])[0]
-        if distance.size and distance.max() > _TOLERANCE:
-            furthest = first + 1 + int(distance.argmax())
-            kept.add(furthest)
-            pieces += [(first, furthest), (furthest, last)]
-    return line[sorted(kept)]

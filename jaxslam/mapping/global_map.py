@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
-from jaxslam.core.se2_np import compose, relative
+from jaxslam.core.se2_np import compose, relative, transform
 from jaxslam.core.types import CORNER, JUNCTION
 from jaxslam.mapping import grid_topology, medial_axis
 from jaxslam.mapping.diagram_junctions import corner_junctions
@@ -145,13 +145,10 @@ def moved_with_poses(graph: TopologicalMap, before: np.ndarray, now: np.ndarray)
         before: (K, 3) [m, m, rad] map frame.
         now: (K, 3) the same poses as they are estimated now.
     """
-    tree, transform = cKDTree(before[:, :2]), compose(now, relative(before, np.zeros(3)))
+    tree, frames = cKDTree(before[:, :2]), compose(now, relative(before, np.zeros(3)))
 
     def moved(points: np.ndarray) -> np.ndarray:
-        frame = transform[tree.query(points)[1]]
-        cosine, sine = np.cos(frame[:, 2]), np.sin(frame[:, 2])
-        x, y = points.T
-        return frame[:, :2] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
+        return transform(frames[tree.query(points)[1]], points)
 
     return graph._replace(
         xy=moved(graph.xy) if len(graph.xy) else graph.xy,

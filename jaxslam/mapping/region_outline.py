@@ -3,6 +3,8 @@
 import numpy as np
 from scipy import ndimage
 
+from jaxslam.core import polylines
+
 TOLERANCE = 1.0  # [cells] of a polygon
 
 
@@ -62,31 +64,10 @@ def _boundary(cells: np.ndarray) -> np.ndarray:
 
 
 def _simplified(polygon: np.ndarray) -> np.ndarray:
-    """Polygon of fewer corners, at most `TOLERANCE` from the given one (n, 2).
-
-    References:
-        Douglas, Peucker (1973), Algorithms for the reduction of the number of points required to
-        represent a digitized line or its caricature.
-    """
+    """Polygon of fewer corners, at most `TOLERANCE` from the given one (n, 2)."""
     first = int(np.lexsort(polygon.T[::-1])[0])
     loop = np.roll(polygon, -first, axis=0)
     loop = np.concatenate([loop, loop[:1]])
     middle = int(np.hypot(*(loop - loop[0]).T).argmax())
-    kept, pieces = {0, middle}, [(0, middle), (middle, len(loop) - 1)]
-    while pieces:
-        start, stop = pieces.pop()
-        if stop - start < 2:
-            continue
-        away = _distances(loop[start + 1 : stop], loop[start], loop[stop])
-        if away.max() > TOLERANCE:
-            furthest = start + 1 + int(away.argmax())
-            kept.add(furthest)
-            pieces += [(start, furthest), (furthest, stop)]
-    return loop[sorted(kept)]
-
-
-def _distances(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distances (n,) of points (n, 2) from the segment between two points (2,)."""
-    step, offset = end - start, points - start
-    share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
-    return np.hypot(offset[:, 0] - share * step[0], offset[:, 1] - share * step[1])
+    halves = loop[: middle + 1], loop[middle:]
+    return np.concatenate([polylines.simplify(half, TOLERANCE)[:-1] for half in halves])

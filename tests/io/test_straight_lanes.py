@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from small_building import building, planner, regions
 
-from jaxslam.io.straight_lanes import simplified, straight_lanes
+from jaxslam.core.polylines import simplify
+from jaxslam.io.straight_lanes import straight_lanes
 
 
 def distance(points, line):
@@ -20,10 +21,10 @@ def distance(points, line):
 def test_no_point_of_a_line_is_farther_than_the_tolerance_and_few_are_kept(tolerance):
     s = np.linspace(0.0, 6.0, 200)
     line = np.stack([s, np.sin(s)], axis=1)
-    kept = simplified(line, tolerance)
+    kept = simplify(line, tolerance)
     assert (kept[0] == line[0]).all() and (kept[-1] == line[-1]).all()
     assert distance(line, kept).max() <= tolerance + 1e-3 and len(kept) < 20
-    assert len(simplified(line[[0, 50, 50, 199]], 9.0)) == 2
+    assert len(simplify(line[[0, 50, 50, 199]], 9.0)) == 2
 
 
 def along(found, arc):

@@ -42,9 +42,10 @@ class PlanLog(NamedTuple):
 
 
 def tour(walls: np.ndarray, spacing: float) -> np.ndarray:
-    """A path (N, 2) [m] that comes within `spacing` [m] of all that can be reached.
+    """A path (N, 2) [m] from which all that can be reached is seen, from `spacing` [m] or nearer.
 
-    It visits places that are `spacing` apart, each time the nearest one that is left.
+    It visits places that are `spacing` apart or hidden from each other, each time the nearest one
+    that is left.
 
     Args:
         walls: (S, 4) [m] without padding.
@@ -55,21 +56,25 @@ def tour(walls: np.ndarray, spacing: float) -> np.ndarray:
     part = csgraph.connected_components(matrix, directed=False)[1]
     own = np.flatnonzero(part == np.bincount(part).argmax())
     goals: list[int] = []
-    for k in rng.permutation(own).tolist():
-        if all(np.hypot(*(points[k] - points[goal])) > spacing for goal in goals):
-            goals.append(k)
+    left = rng.permutation(own)
+    while left.size:
+        goals.append(int(left[0]))
+        here = points[left[:1]]
+        near = np.hypot(*(points[left] - here).T) <= spacing
+        near[near] = ground_truth.in_sight(here, points[None, left[near]], walls)[0]
+        left = left[~near & (left != goals[-1])]
     length, before = csgraph.dijkstra(
         matrix, directed=False, indices=goals, return_predecessors=True
     )
-    here, left, path = 0, set(range(1, len(goals))), [goals[0]]
-    while left:
-        following = min(left, key=lambda n: length[here, goals[n]])
+    at, ahead, path = 0, set(range(1, len(goals))), [goals[0]]
+    while ahead:
+        following = min(ahead, key=lambda n: length[at, goals[n]])
         leg = [goals[following]]
-        while leg[-1] != goals[here]:
-            leg.append(int(before[here, leg[-1]]))
+        while leg[-1] != goals[at]:
+            leg.append(int(before[at, leg[-1]]))
         path += leg[::-1][1:]
-        left.remove(following)
-        here = following
+        ahead.remove(following)
+        at = following
     line = ndimage.uniform_filter1d(points[path], _WIDTH, axis=0, mode="nearest")
     return path_following.densify(line)
 

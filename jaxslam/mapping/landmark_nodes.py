@@ -13,9 +13,12 @@ from jaxslam.mapping.plane_graph import Line, PlaneGraph
 SAME_PLACE = 0.2
 """[m] or half of the clearance, if that is less, within which node and landmark are the same.
 
-The nodes of a diagram are good to two cells; what is farther off is another junction, perhaps of a
-branch into a corner, which the diagram does not have.
+What is farther off is another junction, perhaps of a branch into a corner, which the diagram does
+not have.
 """
+
+ACCURACY = 0.1
+"""[m] of the nodes of a diagram, two cells: none is moved farther, as it would be another place."""
 
 SAME_NODE = 0.5
 """[m] within which nodes of two maps are the same."""
@@ -33,7 +36,7 @@ def place_landmarks(
 ) -> dict[int, int]:
     """Make landmarks nodes of a diagram, in place.
 
-        o  junction or dead end of the diagram:   it is the landmark, and moves onto it
+        o  junction or dead end of the diagram:   it is the landmark; within `ACCURACY`, it moves
         -  an arc passes the landmark:            it is split there
            the arc is within the circle:          a spur leads to the landmark, inside its circle
            none of these:                         the landmark is no node: space is otherwise there
@@ -64,11 +67,12 @@ def place_landmarks(
                 node = int(ends[near])
                 pairs.append((float(np.hypot(*(graph.xy[node] - xy[k]))), k, node))
     placed: set[int] = set()
-    for _, k, node in sorted(pairs):
+    for distance, k, node in sorted(pairs):
         if node not in names and k not in placed:
             names[node] = k
             placed.add(k)
-            _move(graph, node, xy[k], space)
+            if distance <= ACCURACY:
+                _move(graph, node, xy[k], space)
     for k in usable.tolist() if junctions is None else ():
         if k in placed:
             continue

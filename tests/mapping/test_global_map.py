@@ -54,11 +54,11 @@ def net_of(graph):
 
 
 def test_a_junction_that_is_a_landmark_has_its_id_and_place():
-    known = landmarks([[6.05, 3.9], [3.5, 4.1], [9.9, 0.5]], [1.1, 1.0, 1.0], [7, 3, 5])
+    known = landmarks([[6.05, 3.75], [3.5, 4.1], [9.9, 0.5]], [1.1, 1.0, 1.0], [7, 3, 5])
     found = build_global_map(drawn(*T_SHAPE), DRIVE, known, 20)
     graph = found.graph
     where = {int(k): xy for k, xy in zip(graph.id, graph.xy, strict=True)}
-    np.testing.assert_array_equal(where[7], [6.05, 3.9])  # the junction
+    np.testing.assert_array_equal(where[7], [6.05, 3.75])  # the junction
     np.testing.assert_array_equal(where[3], [3.5, 4.1])  # on an arc, which is split there
     assert 5 not in where  # a wall is there now
     degree = dict(net_of(graph).degree())

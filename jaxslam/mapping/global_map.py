@@ -7,7 +7,7 @@ estimated poses, and the diagram is that of the whole:
 
     free cells of all scans -> medial axis of the space that the robot reaches (`medial_axis`)
     -> landmarks that lie on it are its nodes (`landmark_nodes`) -> arcs through open space
-    (`open_space`) -> ids
+    (`open_space`) -> open ends (`open_ends`) -> ids
 
 When the smoother moves poses, the map is made anew from them, and is still the same graph: a node
 that is a landmark has its id, and any other that of the node of the map before that lies there
@@ -18,7 +18,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
@@ -29,6 +28,7 @@ from jaxslam.mapping import grid_topology, medial_axis
 from jaxslam.mapping.diagram_junctions import corner_junctions
 from jaxslam.mapping.landmark_nodes import kept_ids, place_landmarks
 from jaxslam.mapping.medial_axis import FreeConfigurations
+from jaxslam.mapping.open_ends import find_open_ends
 from jaxslam.mapping.open_space import FreeSpace, fill_open_space
 
 RESOLUTION = 0.05
@@ -39,9 +39,6 @@ MIN_SHARE = 0.01
 
 STEP = 1.0
 """[m] The robot drove straight between two poses that are no further apart than this."""
-
-UNKNOWN_NEAR = 0.5
-"""[m] from unknown space, within which an open end may lie."""
 
 
 class GlobalMap(NamedTuple):
@@ -73,7 +70,7 @@ def build_global_map(
     Args:
         occupancy: The grid, not turned against the map frame.
         poses: (T, 3) [m, m, rad] trajectory, map frame; NaN between two drives.
-        merged: The landmarks, their corners and open ends, as `topological_map.build_map` has them.
+        merged: The landmarks and corners, as `topological_map.build_map` has them.
         next_id: Id of the next node.
         previous: An earlier map of the same place, its nodes moved with the poses; nodes that are
             still there keep their ids.
@@ -114,6 +111,7 @@ def build_global_map(
         graph, merged.xy[junctions], merged.clearance[junctions], place, known
     )
     fill_open_space(graph, place)
+    frontiers, frontier_node = find_open_ends(graph, place, occupancy)
     xy = np.array(graph.xy)
     ids = np.full(len(xy), -1)
     ids[list(landmarks)] = merged.id[junctions[list(landmarks.values())]]
@@ -131,9 +129,8 @@ def build_global_map(
         arc_lines=lines,
         arc_filled=np.array([not line.is_branch for line in graph.arcs.values()], bool),
     )
-    ends = _open_ends(merged, result, occupancy, place)
-    open_ids, next_id = _open_end_ids(ends[0], result, previous, next_id)
-    result = result._replace(frontiers=ends[0], frontier_node=ends[1], frontier_id=open_ids)
+    open_ids, next_id = _open_end_ids(frontiers, result, previous, next_id)
+    result = result._replace(frontiers=frontiers, frontier_node=frontier_node, frontier_id=open_ids)
     return GlobalMap(result, occupancy, next_id)
 
 
@@ -191,31 +188,6 @@ def _without(previous: TopologicalMap | None, ids: np.ndarray) -> TopologicalMap
         return None
     kept = (previous.kind == JUNCTION) & ~np.isin(previous.id, ids)
     return previous._replace(id=previous.id[kept], xy=previous.xy[kept])
-
-
-def _open_ends(
-    merged: TopologicalMap, graph: TopologicalMap, occupancy: OccupancyMap, place: FreeSpace
-) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Open ends of the diagrams of single scans that lead to unknown space; and their nodes."""
-    known = occupancy.free | occupancy.occupied
-    size = round(UNKNOWN_NEAR / occupancy.resolution)
-    near_unknown = (
-        ndimage.distance_transform_cdt(np.pad(known, 1), "chessboard")[1:-1, 1:-1] <= size
-    )
-    node_of = {int(name): n for n, name in enumerate(graph.id.tolist())}
-    lines, nodes = [], []
-    for line, start in zip(merged.frontiers, merged.frontier_node.tolist(), strict=True):
-        node = node_of.get(int(merged.id[start]))
-        cell = np.floor((line[-1] - occupancy.origin[:2]) / occupancy.resolution).astype(int)
-        inside = bool(((cell >= 0) & (cell < known.shape)).all())
-        if node is None or not inside or not near_unknown[tuple(cell)]:
-            continue
-        line = np.concatenate([graph.xy[[node]], line[1:]])
-        dense = polylines.resample(line, int(2 * polylines.length(line) / place.resolution) + 2)
-        if (place.at(dense) > 0.0).all():
-            lines.append(line)
-            nodes.append(node)
-    return tuple(lines), np.array(nodes, int)
 
 
 def _open_end_ids(

@@ -130,38 +130,65 @@ def _matrix(edges: list[tuple[int, int, float]], size: int) -> sparse.csr_array:
     return sparse.csr_array((table[order, 2] + 1e-9, tuple(pairs[order].T)), shape=(size, size))
 
 
-def _add_spurs(graph: PlaneGraph, space: FreeSpace) -> None:
-    """Join free space that is far from all arcs to the nearest one."""
-    block = max(1, round(BLOCK / space.resolution))
-    blocks, centres, index = _blocks(space, block)
-    size = block * space.resolution
-    while True:
-        points, _ = _points_of(graph, SPACING)
-        cell = np.floor((points - space.corner) / size).astype(int)
-        cell = np.clip(cell, 0, np.array(index.shape) - 1)
-        sources = np.unique(index[tuple(cell.T)])
-        distance, before, _ = csgraph.dijkstra(
-            blocks,
+class Approach:
+    """Shortest free paths from the arcs of a graph to all free space, in squares of cells.
+
+    Attributes:
+        centres: (B, 2) [m] positions of the squares.
+        length: (B,) [m] of the paths; infinite where there is none.
+    """
+
+    def __init__(self, graph: PlaneGraph, space: FreeSpace) -> None:
+        """The paths of a graph as it is now; all its arcs lie in the free space."""
+        block = max(1, round(BLOCK / space.resolution))
+        matrix, self.centres, self._index = _blocks(space, block)
+        self._graph, self._space, self._size = graph, space, block * space.resolution
+        sources = np.unique(self._squares(_points_of(graph, SPACING)[0]))
+        self.length, self._before, _ = csgraph.dijkstra(
+            matrix,
             directed=False,
             indices=sources[sources >= 0],
             min_only=True,
             return_predecessors=True,
         )
-        distance[~np.isfinite(distance)] = 0.0
-        far = np.flatnonzero(distance > COVER)
+
+    def _squares(self, points: np.ndarray) -> np.ndarray:
+        """Squares (N,) int that points (N, 2) [m] lie in, -1 for none."""
+        cell = np.floor((points - self._space.corner) / self._size).astype(int)
+        return self._index[tuple(np.clip(cell, 0, np.array(self._index.shape) - 1).T)]
+
+    def to(self, point: np.ndarray) -> tuple[int, np.ndarray] | None:
+        """The path to a point (2,) [m] of free space; the arc that it begins at is split there.
+
+        Returns:
+            The node, and the path (n, 2) [m] from it to the point; one point if that is the node.
+            None if there is no path.
+        """
+        square = int(self._squares(point[None])[0])
+        if not np.isfinite(self.length[square]):
+            return None
+        path = [square]
+        while self._before[path[-1]] >= 0:
+            path.append(int(self._before[path[-1]]))
+        root = self._graph.node_on(self.centres[path[-1]])
+        line = np.vstack([point, self.centres[path[1:-1]], self._graph.xy[root]])
+        line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 0.0])]
+        return root, self._space.straightened(line)[::-1]
+
+
+def _add_spurs(graph: PlaneGraph, space: FreeSpace) -> None:
+    """Join free space that is far from all arcs to the nearest one."""
+    while True:
+        approach = Approach(graph, space)
+        far = np.flatnonzero(np.isfinite(approach.length) & (approach.length > COVER))
         if not len(far):
             return
-        taken: list[int] = []
-        for k in far[np.argsort(-distance[far], kind="stable")].tolist():
-            if all(np.hypot(*(centres[k] - centres[other])) > 2 * COVER for other in taken):
-                taken.append(k)
-        for k in taken:
-            path = [k]
-            while before[path[-1]] >= 0:
-                path.append(int(before[path[-1]]))
-            root = graph.node_on(centres[path[-1]])
-            line = space.straightened(np.vstack([centres[path[:-1]], graph.xy[root]]))
-            graph.add_arc(Line(graph.add_node(line[0]), root, line, False))
+        far = far[np.argsort(-approach.length[far], kind="stable")]
+        for end in approach.centres[far[apart(approach.centres[far], 2 * COVER)]]:
+            found = approach.to(end)
+            if found is not None:
+                root, line = found
+                graph.add_arc(Line(graph.add_node(end), root, line[::-1], False))
 
 
 def _blocks(space: FreeSpace, block: int) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
@@ -194,16 +221,16 @@ def _blocks(space: FreeSpace, block: int) -> tuple[sparse.csr_array, np.ndarray,
     ]
     edges = np.concatenate(pairs)
     edges = edges[(edges >= 0).all(axis=1)]
-    apart = np.hypot(*(centres[edges[:, 0]] - centres[edges[:, 1]]).T)
+    length = np.hypot(*(centres[edges[:, 0]] - centres[edges[:, 1]]).T)
     shape = (len(centres), len(centres))
-    return sparse.csr_array((apart, tuple(edges.T)), shape=shape), centres, index
+    return sparse.csr_array((length, tuple(edges.T)), shape=shape), centres, index
 
 
 def _add_shortcuts(graph: PlaneGraph, space: FreeSpace) -> None:
     """Join points of arcs that see each other where the graph leads around; the worst first."""
     for _ in range(MAX_ROUNDS):
         points, edges = _points_of(graph, SPACING)
-        ends = _apart(points, SPACING)
+        ends = apart(points, SPACING)
         over = csgraph.dijkstra(_matrix(edges, len(points)), directed=False, indices=ends)[:, ends]
         points = points[ends]
         straight = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
@@ -223,7 +250,7 @@ def _add_shortcuts(graph: PlaneGraph, space: FreeSpace) -> None:
             graph.add_segment(points[i], points[j])
 
 
-def _apart(points: np.ndarray, distance: float) -> np.ndarray:
+def apart(points: np.ndarray, distance: float) -> np.ndarray:
     """Indices (K,) of points (N, 2) that are `distance` [m] apart, in order, none left out else."""
     tree, kept = cKDTree(points), np.ones(len(points), bool)
     for k in range(len(points)):

@@ -129,19 +129,37 @@ def test_ids_stay_when_the_poses_move(turn):
 
 
 def test_open_ends_lead_to_unknown_space_alone():
-    line = np.array([[6.0, 4.0], [6.0, 4.7]])
-    known = landmarks([[6.0, 4.0]], [1.0], [7])._replace(
-        frontiers=(line, np.array([[6.0, 4.0], [9.0, 4.0]])), frontier_node=np.array([0, 0])
-    )
-    open_above = drawn(*T_SHAPE, (5.0, 5.0, 7.0, 7.5), unknown=[(5.0, 5.0, 7.0, 7.5)])
-    found = build_global_map(open_above, DRIVE, known, 20)
+    known = landmarks([[6.0, 3.75]], [1.0], [7])
+    unknown = [(5.0, 5.0, 7.0, 7.5), (1.0, 0.0, 1.3, 3.0)]  # beyond an opening; behind the wall
+    grid = drawn(*T_SHAPE, (5.0, 5.0, 7.0, 7.5), unknown=unknown)
+    found = build_global_map(grid, DRIVE, known, 20)
     (frontier,) = found.graph.frontiers
-    np.testing.assert_array_equal(frontier[-1], line[-1])
-    assert found.graph.id[found.graph.frontier_node[0]] == 7
+    np.testing.assert_allclose(frontier[-1], [6.0, 5.0 - 0.2], atol=1.5 * CELL)
+    start = found.graph.frontier_node[0]
+    np.testing.assert_array_equal(frontier[0], found.graph.xy[start])
+    assert net_of(found.graph).degree(start) > 0
     assert found.graph.frontier_id[0] == found.next_id - 1
-    again = build_global_map(open_above, DRIVE, known, found.next_id, previous=found.graph)
+    again = build_global_map(grid, DRIVE, known, found.next_id, previous=found.graph)
     np.testing.assert_array_equal(again.graph.frontier_id, found.graph.frontier_id)
     assert not build_global_map(drawn(*T_SHAPE), DRIVE, known, 20).graph.frontiers
+
+
+def test_an_opening_that_the_robot_does_not_fit_through_is_no_open_end():
+    for width, ends in ((0.3, 0), (0.6, 1)):
+        opening = (6.0 - width / 2, 5.0, 6.0 + width / 2, 5.2)
+        walls = drawn(*T_SHAPE, opening, unknown=[(5.0, 5.2, 7.0, 7.5)])
+        graph = build_global_map(walls, DRIVE, NOTHING, 0).graph
+        assert len(graph.frontiers) == ends
+    small = drawn(*T_SHAPE, (5.8, 5.0, 6.2, 5.2), unknown=[(5.8, 5.0, 6.2, 5.2)])
+    assert not build_global_map(small, DRIVE, NOTHING, 0).graph.frontiers
+
+
+def test_a_wide_open_side_has_open_ends_all_along():
+    """A hall of 10 m x 2 m whose upper side no scan has seen: ends 3.6 m apart."""
+    grid = drawn((1.0, 3.0, 11.0, 5.0), (1.0, 5.0, 11.0, 7.5), unknown=[(1.0, 5.0, 11.0, 7.5)])
+    ends = np.array([x[-1] for x in build_global_map(grid, DRIVE, NOTHING, 0).graph.frontiers])
+    assert len(ends) == 3 and (abs(ends[:, 1] - 4.8) < 2 * CELL).all()
+    assert (np.diff(np.sort(ends[:, 0])) >= 3.6).all()
 
 
 def test_without_free_space_the_merged_map_is_kept():

@@ -73,8 +73,8 @@ class PlannerData(NamedTuple):
         node_region: (N,) int index of the region that a node lies in, -1 for none.
         arc_region: (A,) int index of the region that most of an arc lies in, -1 for none.
         arc_doors: Indices of the doors that each arc passes through, in its direction.
-        arc_widths: A arrays (n,) [m] distance to the nearest obstacle at the points of its
-            polyline, the arc's width profile; NaN where it is not known.
+        arc_widths: A arrays (n,) [m] distance to the nearest obstacle at places of the arc, evenly
+            from its first end to its last, its width profile; NaN where it is not known.
     """
 
     node_region: np.ndarray

@@ -8,7 +8,7 @@ from jaxslam.core.regions import Door, PlannerData, Regions
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.mapping.clearance import clearance_at, clearance_field
 
-SPACING = 0.1  # [m] between the points of an arc whose regions are counted
+SPACING = 0.05  # [m] between the places of an arc that are looked at, at most
 DOOR_MARGIN = 0.1  # [m] by which a door's line is longer than its jambs are apart, at either end
 
 
@@ -27,15 +27,17 @@ def planner_data(
     """
     check_types(graph, occupancy, regions)
     lines = graph.arc_lines
-    widths = clearance_at(clearance_field(occupancy), np.concatenate([np.zeros((0, 2)), *lines]))
-    last = np.cumsum([len(line) for line in lines], dtype=int)
+    places = [
+        polylines.resample(line, 2 + int(polylines.length(line) / SPACING)) for line in lines
+    ]
+    widths = clearance_at(clearance_field(occupancy), np.concatenate([np.zeros((0, 2)), *places]))
+    last = np.cumsum([len(along) for along in places], dtype=int)
     node_region, arc_region = np.full(len(graph.xy), -1), np.full(len(lines), -1)
     arc_doors: list[tuple[int, ...]] = [()] * len(lines)
     if regions is not None:
         node_region = region_at(regions, graph.xy)
-        for k, line in enumerate(lines):
-            count = 1 + int(np.ceil(polylines.length(line) / SPACING))
-            arc_region[k] = most_common(region_at(regions, polylines.resample(line, count)))
+        for k, (line, along) in enumerate(zip(lines, places, strict=True)):
+            arc_region[k] = most_common(region_at(regions, along))
             arc_doors[k] = tuple(door for _, door in doors_crossed(regions.doors, line))
     return PlannerData(
         node_region=node_region,

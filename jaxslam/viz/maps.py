@@ -321,7 +321,7 @@ def draw_occupancy(axis: Axes, grid: OccupancyMap) -> None:
 
 
 def draw_topological_map(axis: Axes, graph: TopologicalMap) -> None:
-    """Draw the topological map of an occupancy grid; nodes and dead ends differ in marker."""
+    """Draw the topological map of an occupancy grid; nodes, dead and open ends differ in marker."""
     xy = as_float64("graph.xy", graph.xy, ("N", 2))
     axis.add_collection(
         LineCollection(graph.arc_lines, label="arc", colors=BLUE, linewidths=1.1, zorder=1.5)
@@ -333,3 +333,9 @@ def draw_topological_map(axis: Axes, graph: TopologicalMap) -> None:
     ):
         if use.any():
             _draw_markers(axis, xy[use], marker, colour, name, 2)
+    if graph.frontiers:
+        axis.add_collection(
+            LineCollection(graph.frontiers, colors=BLUE, linewidths=0.9, linestyles=":", zorder=1.4)
+        )
+        ends = np.array([line[-1] for line in graph.frontiers])
+        _draw_markers(axis, ends, "^", GREEN, "open end", 3)

@@ -107,11 +107,13 @@ def test_the_picture_shows_the_map_where_it_is():
     np.testing.assert_allclose(corners, [[1, 2], [1, 12], [-4, 12], [-4, 2]], atol=1e-12)
     axis = canvas.map_canvas(*canvas.extent(corners))[1]
     maps.draw_occupancy(axis, grid)
-    maps.draw_topological_map(axis, graph_of_two())
+    maps.draw_topological_map(axis, graph_of_two()._replace(frontiers=(np.eye(2),)))
     (image,) = axis.images
     shown = image.get_transform() - axis.transData
     np.testing.assert_allclose(shown.transform((20, 10)), [-4.0, 12.0], atol=1e-9)
-    assert len(axis.collections[0].get_segments()) == 3
+    assert [len(lines.get_segments()) for lines in axis.collections] == [3, 1]
+    ends = {line.get_label(): line.get_xydata() for line in axis.lines}
+    np.testing.assert_array_equal(ends["open end"], [[0.0, 1.0]])
 
 
 @pytest.fixture

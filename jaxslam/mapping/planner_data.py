@@ -27,9 +27,7 @@ def planner_data(
     """
     check_types(graph, occupancy, regions)
     lines = graph.arc_lines
-    places = [
-        polylines.resample(line, 2 + int(polylines.length(line) / SPACING)) for line in lines
-    ]
+    places = [polylines.resample(line, 2 + int(polylines.length(line) / SPACING)) for line in lines]
     widths = clearance_at(clearance_field(occupancy), np.concatenate([np.zeros((0, 2)), *places]))
     last = np.cumsum([len(along) for along in places], dtype=int)
     node_region, arc_region = np.full(len(graph.xy), -1), np.full(len(lines), -1)

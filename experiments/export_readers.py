@@ -138,9 +138,12 @@ def compute(folder: Path) -> Numbers:
 def draw(numbers: Numbers, path: Path) -> None:
     """Draw both optima, one over the other."""
     figure, axes = common.canvas(6.0, 5.0, 1, 1)
-    for key, colour, width in (("own_optimum", common.SKY, 4.0), ("optimum", common.BLACK, 1.0)):
+    for key, colour, width, label in (
+        ("own_optimum", common.SKY, 4.0, "optimum of jaxslam"),
+        ("optimum", common.BLACK, 1.0, "optimum of GTSAM"),
+    ):
         line = np.array(numbers["g2o"][key])
-        axes[0, 0].plot(*line.T, color=colour, linewidth=width, label=key.replace("_", " "))
+        axes[0, 0].plot(*line.T, color=colour, linewidth=width, label=label)
     axes[0, 0].set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes[0, 0].legend()
     figure.savefig(path)

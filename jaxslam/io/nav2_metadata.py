@@ -35,15 +35,20 @@ def node_metadata(label: Label) -> dict[str, Any]:
     return {k: v for k, v in {"region": label.region, "class": label.kind}.items() if v}
 
 
-def edge_metadata(label: Label, clearance: float) -> dict[str, Any]:
-    """Metadata of an edge of this clearance [m], NaN where it is not known."""
+def edge_metadata(label: Label, speed: float) -> dict[str, Any]:
+    """Metadata of an edge on which this fraction of the full speed may be driven."""
     door = {"door": ",".join(label.doors)} if label.doors else {}
-    return node_metadata(label) | door | {"speed_limit": speed_limit(clearance)}
+    return node_metadata(label) | door | {"speed_limit": _percent(speed)}
 
 
 def speed_limit(clearance: float) -> float:
     """Speed limit [%] of an edge of this clearance [m], to 0.1 %."""
-    return round(100.0 * speed_fraction(clearance), 1)
+    return _percent(speed_fraction(clearance))
+
+
+def _percent(speed: float) -> float:
+    """A fraction of the full speed [%], to 0.1 %."""
+    return round(100.0 * speed, 1)
 
 
 def door_operations(label: Label) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.types import JUNCTION
 from jaxslam.io.geojson import FRONTIER, KINDS, Arc, Node
 from jaxslam.io.nav2_metadata import door_operations, edge_metadata, node_metadata
-from jaxslam.io.route_labels import Label, arc_clearances, labels
+from jaxslam.io.route_labels import Label, arc_clearances, labels, speed_fraction
 
 FILLED = {"filled": True}
 """Metadata of an arc through open space, which is no branch of the Voronoi diagram."""
@@ -53,7 +53,8 @@ def route_graph(
             float(graph.arc_length[index]),
             clearance,
             graph.arc_lines[index],
-            metadata=edge_metadata(label, clearance) | (FILLED if index in filled else {}),
+            metadata=edge_metadata(label, speed_fraction(clearance))
+            | (FILLED if index in filled else {}),
             operations=door_operations(label) if with_operations else {},
         )
         arcs.append(arc)
@@ -71,6 +72,6 @@ def _open_ends(graph: TopologicalMap) -> tuple[list[Node], list[Arc]]:
         x, y = np.asarray(line, np.float64)[-1]
         nodes.append(Node(int(frontier), float(x), float(y), FRONTIER, np.nan))
         length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-        start, own = int(graph.id[node]), edge_metadata(Label(), np.nan)
+        start, own = int(graph.id[node]), edge_metadata(Label(), speed_fraction(np.nan))
         arcs.append(Arc(index, start, int(frontier), length, np.nan, line, metadata=own))
     return nodes, arcs

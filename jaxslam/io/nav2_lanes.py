@@ -1,0 +1,68 @@
+"""Topological maps as route graphs of straight edges, for the controllers behind nav2_route.
+
+nav2_route leads a robot straight from node to node: the polylines of `map.geojson` are not driven.
+Here the points of `straight_lanes` are nodes, so that no edge is farther than a tolerance from its
+arc. Nodes of the map keep their ids, `metadata.map_arc` is the arc of the map, and a door is opened
+by the short edge that passes through it.
+"""
+
+from os import PathLike
+
+import numpy as np
+
+from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.regions import Regions
+from jaxslam.io import geojson
+from jaxslam.io.nav2_metadata import door_operations, edge_metadata, node_metadata
+from jaxslam.io.route_labels import DOOR
+from jaxslam.io.straight_lanes import StraightLanes
+
+
+def write(
+    path: str | PathLike,
+    graph: TopologicalMap,
+    layout: StraightLanes,
+    regions: Regions | None = None,
+) -> None:
+    """Write the lanes of a map.
+
+    Args:
+        path: File to write, atomically.
+        graph: The map.
+        layout: Its points and lanes.
+        regions: Its rooms and doors.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    known = [int(name) for name in layout.names if name.isdecimal()]
+    taken = np.concatenate([graph.id, graph.frontier_id]).astype(int).tolist()
+    first = 1 + max(taken, default=-1)
+    ids = [*known, *range(first, first + len(layout.names) - len(known))]
+    nodes = [
+        geojson.Node(
+            node, float(x), float(y), geojson.KINDS[0], np.nan, metadata=node_metadata(label)
+        )
+        for node, (x, y), label in zip(ids, layout.xy, layout.labels, strict=True)
+    ]
+    kinds = {region.name: region.kind for region in regions.regions} if regions else {}
+    arcs = []
+    for number, lane in enumerate(layout.lanes):
+        points = layout.xy[[lane.start, lane.end]]
+        doors = (lane.door,) if lane.door else ()
+        label = lane.label._replace(doors=doors, leaves=doors)
+        if not doors and label.kind == DOOR:
+            label = label._replace(kind=kinds.get(label.region, ""))
+        arcs.append(
+            geojson.Arc(
+                number,
+                ids[lane.start],
+                ids[lane.end],
+                float(np.hypot(*(points[1] - points[0]))),
+                np.nan,
+                points,
+                metadata=edge_metadata(label, lane.speed) | {"map_arc": lane.arc},
+                operations=door_operations(label),
+            )
+        )
+    geojson.write(path, nodes, arcs)

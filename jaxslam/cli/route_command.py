@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from jaxslam.cli import report, summaries
+from jaxslam.cli import map_files, summaries
 from jaxslam.cli.options import OutFolder, check_range
-from jaxslam.evaluation.summary import Metrics
+from jaxslam.core.types import Metrics
 from jaxslam.io.errors import InputError
 from jaxslam.io.map_folder import MapFolder, read_map_folder
 from jaxslam.io.output import folder, write_json
@@ -77,7 +77,7 @@ def plan_route(
         content = _content(planned, known, legs) | {"goal_region": name}
         write_json(out_dir / "route.json", content | {"robot_radius_m": robot_radius})
         write_json(out_dir / "metrics.json", numbers)
-        report.draw_route(
+        map_files.draw_route(
             out_dir / "route.png",
             known.graph,
             planned,

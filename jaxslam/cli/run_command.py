@@ -9,28 +9,30 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, room_results, run_results, summaries
+from jaxslam.cli.log_options import (
+    Scanner,
+    ScannerOptions,
+    read_params,
+    require_beams,
+    require_odometry,
+)
 from jaxslam.cli.options import (
     FileOfEach,
     OptionalCount,
     OptionalFile,
     OptionalTopic,
     OutFolder,
-    Scanner,
-    ScannerOptions,
     check_range,
     name_errors,
-    read_params,
-    require_beams,
-    require_odometry,
-    stopwatch,
 )
 from jaxslam.cli.run_evaluation import RecordedDrive, without_errors
 from jaxslam.cli.run_results import RunContext
+from jaxslam.cli.stopwatch import stopwatch
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.log_errors import Trajectory
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import annotated_map, tum

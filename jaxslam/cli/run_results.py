@@ -19,8 +19,8 @@ from jaxslam.core.measurement import Measurement
 from jaxslam.core.regions import Regions
 from jaxslam.core.se2_np import compose, relative, trajectories_as_one
 from jaxslam.core.time_series import match_times
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import log_errors
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import tum

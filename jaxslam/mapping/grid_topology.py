@@ -11,7 +11,6 @@ Two nodes may be joined by several arcs, and a ring without a junction is one no
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
@@ -82,8 +81,8 @@ def extract_topology(
         ValueError: The robot fits nowhere, or an argument has another type, shape or range.
     """
     occupied, free = np.asarray(occupied), np.asarray(free)
-    check_array("occupied", occupied, ("H", "W"), jnp.bool_)
-    check_array("free", free, occupied.shape, jnp.bool_)
+    check_array("occupied", occupied, ("H", "W"), np.bool_)
+    check_array("free", free, occupied.shape, np.bool_)
     origin = as_float64("origin", origin, (3,))
     _check_sizes(resolution, robot_radius, min_obstacle_size, min_region_area)
     callback(STAGES[0])

@@ -8,7 +8,6 @@ The steps of `find_regions`:
     -> names, those of an earlier division where they fit (`region_names`)
 """
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
@@ -64,8 +63,8 @@ def find_regions(
         modalities using free space layout.
     """
     occupied, free = np.asarray(occupied), np.asarray(free)
-    check_array("occupied", occupied, ("H", "W"), jnp.bool_)
-    check_array("free", free, occupied.shape, jnp.bool_)
+    check_array("occupied", occupied, ("H", "W"), np.bool_)
+    check_array("free", free, occupied.shape, np.bool_)
     origin = as_float64("origin", origin, (3,))
     for name, size in (("resolution", resolution), ("robot_radius", robot_radius)):
         if not 0.0 < size < np.inf:

@@ -6,8 +6,9 @@ The palette is that of Okabe and Ito, which is safe for colour-blind readers.
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
-from jaxslam.core.types import AnyArray, as_float64
+from jaxslam.core.types import as_float64
 
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -31,7 +32,7 @@ def canvas(
     )
 
 
-def map_canvas(low: AnyArray, high: AnyArray) -> tuple[Figure, Axes]:
+def map_canvas(low: ArrayLike, high: ArrayLike) -> tuple[Figure, Axes]:
     """Figure 900 dots wide, with an axis for the map of a rectangle, in metres at one scale.
 
     Args:
@@ -54,7 +55,7 @@ def map_canvas(low: AnyArray, high: AnyArray) -> tuple[Figure, Axes]:
     return figure, axis
 
 
-def extent(*groups: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+def extent(*groups: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Bounding box of points or poses; those that are not finite are left out.
 
     Args:

@@ -4,18 +4,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.transforms import Affine2D
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jaxslam.core.regions import Regions
 from jaxslam.core.se2_np import transform
-from jaxslam.core.types import AnyArray
 from jaxslam.viz.canvas import BLACK, GREY, PINK
 
 SHADE = 0.55  # opacity of the colours of rooms
 MAX_NAMES = 150  # rooms whose numbers are drawn
 
 
-def draw_rooms(axis: Axes, regions: Regions, colours: AnyArray) -> None:
+def draw_rooms(axis: Axes, regions: Regions, colours: ArrayLike) -> None:
     """Draw each region in its colour, with the number of its name, and a line across each door.
 
     Args:

@@ -16,7 +16,7 @@ from PIL import Image
 
 import jaxslam
 from jaxslam.cli import main, run_command, simulate_command, tune_command
-from jaxslam.cli.options import _covered
+from jaxslam.cli.stopwatch import _covered
 from jaxslam.core import se2
 from jaxslam.core.se2 import transform
 from jaxslam.core.se2_np import relative

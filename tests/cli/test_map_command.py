@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxslam.cli import main, report
+from jaxslam.cli import main, map_files
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.io import graphml, rooms_file, ros_map
 from jaxslam.viz import canvas, maps
@@ -161,7 +161,7 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "draw_map", stop)
+    monkeypatch.setattr(map_files, "draw_map", stop)
     assert main.main(["map", str(write_map(tmp_path)), "--out", str(tmp_path / "out")]) == 130
     assert {file.name for file in tmp_path.iterdir()} == {"a.pgm", "a.yaml"}
 

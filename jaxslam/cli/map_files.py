@@ -1,0 +1,72 @@
+"""Files and pictures of a map, and the picture of a route over it."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.regions import PlannerData, Regions
+from jaxslam.io import graphml, lif, rmf_graph, rooms_file
+from jaxslam.mapping.planning import PlannedRoute
+
+
+def write_exports(
+    out_dir: Path,
+    graph: TopologicalMap,
+    regions: Regions | None = None,
+    planner: PlannerData | None = None,
+) -> None:
+    """Write map.lif.json, map.rmf.yaml and, if networkx is installed, map.graphml.
+
+    Args:
+        out_dir: Folder to write to.
+        graph: The topological map.
+        regions: Its rooms and doors.
+        planner: Where its nodes and arcs lie.
+    """
+    lif.write(out_dir / "map.lif.json", graph, regions, planner)
+    rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner)
+    if find_spec("networkx") is not None:
+        graphml.write(out_dir / "map.graphml", graph, regions, planner)
+
+
+def draw_map(
+    path: Path, occupancy: OccupancyMap, graph: TopologicalMap, regions: Regions | None = None
+) -> None:
+    """Draw an occupancy grid with its topological map, its rooms and its doors."""
+    # Imported here, because matplotlib is slow to import.
+    from jaxslam.viz import canvas, maps, rooms
+
+    figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
+    maps.draw_occupancy(axis, occupancy)
+    if regions is not None:
+        rooms.draw_rooms(axis, regions, rooms_file.region_colours(regions))
+    maps.draw_topological_map(axis, graph)
+    canvas.legend(figure)
+    figure.savefig(path)
+
+
+def draw_route(
+    path: Path,
+    graph: TopologicalMap,
+    planned: PlannedRoute,
+    *,
+    occupancy: OccupancyMap | None = None,
+    regions: Regions | None = None,
+) -> None:
+    """Draw a route over a topological map, and over the occupancy map and the rooms if known."""
+    # Imported here, because matplotlib is slow to import.
+    from jaxslam.viz import canvas, maps, routes
+
+    corners = np.zeros((0, 2)) if occupancy is None else maps.known_corners(occupancy)
+    figure, axis = canvas.map_canvas(*canvas.extent(corners, graph.xy, planned.line))
+    if occupancy is not None:
+        maps.draw_occupancy(axis, occupancy)
+    if regions is not None:
+        routes.draw_regions(axis, regions)
+    maps.draw_arcs(axis, graph)
+    routes.draw_route(axis, planned)
+    maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
+    canvas.legend(figure)
+    figure.savefig(path)

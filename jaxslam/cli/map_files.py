@@ -1,14 +1,11 @@
-"""Files and pictures of a map, and the picture of a route over it."""
+"""Files and the picture of a map."""
 
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
-
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.io import graphml, lif, rmf_graph, rooms_file
-from jaxslam.mapping.planning import PlannedRoute
 
 
 def write_exports(
@@ -43,30 +40,5 @@ def draw_map(
     if regions is not None:
         rooms.draw_rooms(axis, regions, rooms_file.region_colours(regions))
     maps.draw_topological_map(axis, graph)
-    canvas.legend(figure)
-    figure.savefig(path)
-
-
-def draw_route(
-    path: Path,
-    graph: TopologicalMap,
-    planned: PlannedRoute,
-    *,
-    occupancy: OccupancyMap | None = None,
-    regions: Regions | None = None,
-) -> None:
-    """Draw a route over a topological map, and over the occupancy map and the rooms if known."""
-    # Imported here, because matplotlib is slow to import.
-    from jaxslam.viz import canvas, maps, routes
-
-    corners = np.zeros((0, 2)) if occupancy is None else maps.known_corners(occupancy)
-    figure, axis = canvas.map_canvas(*canvas.extent(corners, graph.xy, planned.line))
-    if occupancy is not None:
-        maps.draw_occupancy(axis, occupancy)
-    if regions is not None:
-        routes.draw_regions(axis, regions)
-    maps.draw_arcs(axis, graph)
-    routes.draw_route(axis, planned)
-    maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
     canvas.legend(figure)
     figure.savefig(path)

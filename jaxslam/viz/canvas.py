@@ -42,15 +42,16 @@ def map_canvas(low: ArrayLike, high: ArrayLike) -> tuple[Figure, Axes]:
     Raises:
         ValueError: `low` or `high` is not two finite numbers, or `high` is below `low`.
     """
-    low, high = as_float64("low", low, (2,)), as_float64("high", high, (2,))
-    if not (np.isfinite([low, high]).all() and (low <= high).all()):
-        raise ValueError(f"low is {low.tolist()} and high {high.tolist()}, which is no rectangle")
-    margin = 0.03 * np.max(high - low) + 0.2
-    low, high = low - margin, high + margin
-    width, height = high - low
+    lowest, highest = as_float64("low", low, (2,)), as_float64("high", high, (2,))
+    if not (np.isfinite([lowest, highest]).all() and (lowest <= highest).all()):
+        wanted = "which is no rectangle"
+        raise ValueError(f"low is {lowest.tolist()} and high {highest.tolist()}, {wanted}")
+    margin = 0.03 * np.max(highest - lowest) + 0.2
+    lowest, highest = lowest - margin, highest + margin
+    width, height = highest - lowest
     figure, axes = canvas(9.0, float(np.clip(8.2 * height / width, 2.5, 9.0)) + 1.1)
     axis = axes[0, 0]
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axis.set(xlim=(lowest[0], highest[0]), ylim=(lowest[1], highest[1]), aspect="equal")
     axis.set(xlabel="x [m]", ylabel="y [m]")
     return figure, axis
 

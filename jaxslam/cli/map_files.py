@@ -6,6 +6,7 @@ from pathlib import Path
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.io import graphml, lif, rmf_graph, rooms_file
+from jaxslam.io.straight_lanes import straight_lanes
 
 
 def write_exports(
@@ -22,8 +23,9 @@ def write_exports(
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
     """
-    lif.write(out_dir / "map.lif.json", graph, regions, planner)
-    rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner)
+    lanes = straight_lanes(graph, regions, planner)
+    lif.write(out_dir / "map.lif.json", graph, regions, planner, lanes=lanes)
+    rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner, lanes=lanes)
     if find_spec("networkx") is not None:
         graphml.write(out_dir / "map.graphml", graph, regions, planner)
 
@@ -41,4 +43,4 @@ def draw_map(
         rooms.draw_rooms(axis, regions, rooms_file.region_colours(regions))
     maps.draw_topological_map(axis, graph)
     canvas.legend(figure)
-    figure.savefig(path)
+    canvas.save(figure, path)

@@ -112,7 +112,7 @@ def draw_route(
     routes.draw_route(axis, planned)
     maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
     canvas.legend(figure)
-    figure.savefig(path)
+    canvas.save(figure, path)
 
 
 def _point(option: str, words: tuple[str, ...]) -> np.ndarray:

@@ -93,11 +93,13 @@ def simplify(line: np.ndarray, tolerance: float) -> np.ndarray:
     kept, pieces = {0, len(line) - 1}, [(0, len(line) - 1)]
     while pieces:
         first, last = pieces.pop()
+        if last - first < 2:
+            continue
         step, offset = line[last] - line[first], line[first + 1 : last] - line[first]
         share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
         distance = np.hypot(offset[:, 0] - share * step[0], offset[:, 1] - share * step[1])
-        if distance.size and distance.max() > tolerance:
-            furthest = first + 1 + int(distance.argmax())
+        furthest = first + 1 + int(distance.argmax())
+        if distance[furthest - first - 1] > tolerance:
             kept.add(furthest)
             pieces += [(first, furthest), (furthest, last)]
     return line[sorted(kept)]

@@ -176,7 +176,7 @@ def _edge_feature(
     return {
         "type": "Feature",
         "properties": _merged(properties, _added(own, arc.metadata, arc.operations)),
-        "geometry": {"type": "MultiLineString", "coordinates": [points.tolist()]},
+        "geometry": {"type": "MultiLineString", "coordinates": [points]},
     }
 
 

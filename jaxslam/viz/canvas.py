@@ -3,6 +3,8 @@
 The palette is that of Okabe and Ito, which is safe for colour-blind readers.
 """
 
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -82,3 +84,12 @@ def extent(*groups: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 def legend(figure: Figure) -> None:
     """Add one legend below all axes of a figure."""
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure to a file; its layout is made first, so that it is drawn only once."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+    figure.set_layout_engine("none")
+    figure.savefig(path)

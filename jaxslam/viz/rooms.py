@@ -65,5 +65,6 @@ def _draw_numbers(axis: Axes, regions: Regions) -> None:
         middle = cells[np.abs(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
         x, y = transform(regions.origin, (middle + 0.5) * regions.resolution).tolist()
         number = regions.regions[k].name.partition("_")[2]
-        style = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.7, "linewidth": 0.0}
-        axis.text(x, y, number, ha="center", va="center", fontsize=5, color=BLACK, bbox=style)
+        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.7, "linewidth": 0.0}
+        text = axis.text(x, y, number, fontsize=5, color=BLACK, bbox=box, in_layout=False)
+        text.set(ha="center", va="center")

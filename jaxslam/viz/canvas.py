@@ -91,5 +91,5 @@ def save(figure: Figure, path: Path) -> None:
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
-    figure.set_layout_engine("none")
+    figure.set_layout_engine(None)
     figure.savefig(path)

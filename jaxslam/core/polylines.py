@@ -96,7 +96,8 @@ def simplify(line: np.ndarray, tolerance: float) -> np.ndarray:
         if last - first < 2:
             continue
         step, offset = line[last] - line[first], line[first + 1 : last] - line[first]
-        share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+        share = offset @ step / max(float(step @ step), 1e-12)
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
         distance = np.hypot(offset[:, 0] - share * step[0], offset[:, 1] - share * step[1])
         furthest = first + 1 + int(distance.argmax())
         if distance[furthest - first - 1] > tolerance:

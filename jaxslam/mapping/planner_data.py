@@ -35,15 +35,25 @@ def planner_data(
     if regions is not None:
         node_region = region_at(regions, graph.xy)
         segments = _segments(regions.doors)
+        arc_region = _arc_regions(regions, lines)
         for k, (line, near) in enumerate(zip(lines, _doors_near(segments, lines), strict=True)):
-            count = 1 + int(np.ceil(polylines.length(line) / SPACING))
-            arc_region[k] = most_common(region_at(regions, polylines.resample(line, count)))
             arc_doors[k] = tuple(near[door] for _, door in _crossed(segments[near], line))
     return PlannerData(
         node_region=node_region,
         arc_region=arc_region,
         arc_doors=tuple(arc_doors),
         arc_widths=tuple(np.split(widths, last[:-1])) if lines else (),
+    )
+
+
+def _arc_regions(regions: Regions, lines: tuple[np.ndarray, ...]) -> np.ndarray:
+    """The region (A,) int in which most of each polyline (n, 2) [m] lies; -1 for none."""
+    counts = [1 + int(np.ceil(polylines.length(line) / SPACING)) for line in lines]
+    points = [polylines.resample(line, n) for line, n in zip(lines, counts, strict=True)]
+    found = region_at(regions, np.concatenate([np.zeros((0, 2)), *points]))
+    last = np.cumsum(counts, dtype=int)
+    return np.array(
+        [most_common(part) for part in np.split(found, last[:-1])] if lines else [], int
     )
 
 

@@ -93,7 +93,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     """Draw the five panels."""
     from matplotlib.collections import LineCollection
 
-    from jaxslam.viz.maps import draw_ellipses
+    from jaxslam.viz.landmarks import draw_ellipses
 
     figure, axes = common.canvas(17.0, 3.9, 1, 5)
     (scan, diagram, found, filtered, mapped) = axes[0]

@@ -8,23 +8,15 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.options import (
-    OptionalFile,
-    OptionalTopic,
-    OutFolder,
-    Scanner,
-    ScannerOptions,
-    name_errors,
-    require_beams,
-    require_odometry,
-    stopwatch,
-)
+from jaxslam.cli.log_options import Scanner, ScannerOptions, require_beams, require_odometry
+from jaxslam.cli.options import OptionalFile, OptionalTopic, OutFolder, name_errors
+from jaxslam.cli.stopwatch import stopwatch
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.scan import Lidar
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.log_errors import Trajectory
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.io import map_file, tum
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder

@@ -4,31 +4,27 @@ import inspect
 import re
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import tyro
 
 import jaxslam
 from jaxslam.cli import deprecated
-from jaxslam.cli.localise_command import localise_in_map
-from jaxslam.cli.map_command import map_occupancy
-from jaxslam.cli.route_command import plan_route
-from jaxslam.cli.run_command import run
-from jaxslam.cli.simulate_command import simulate
-from jaxslam.cli.tune_command import tune
 from jaxslam.io.errors import InputError
 
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
 `jaxslam COMMAND --help` lists the options of a command, `jaxslam --version` prints the version."""
 
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "simulate": simulate,
-    "run": run,
-    "localise": localise_in_map,
-    "map": map_occupancy,
-    "route": plan_route,
-    "tune": tune,
+COMMANDS = {
+    "simulate": "simulate_command.simulate",
+    "run": "run_command.run",
+    "localise": "localise_command.localise_in_map",
+    "map": "map_command.map_occupancy",
+    "route": "route_command.plan_route",
+    "tune": "tune_command.tune",
 }
+"""Module and function of each command."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -49,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     command, *options = deprecated.rewrite(argv)
     try:
         if command in COMMANDS:
-            function = COMMANDS[command]
+            function = function_of(command)
             function.__doc__ = _unwrapped(function.__doc__ or "")
             return tyro.cli(function, prog=f"jaxslam {command}", args=options) or 0
         else:
@@ -63,6 +59,13 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def function_of(command: str) -> Callable[..., Any]:
+    """The function of a command, imported here, so that a command imports only what it needs."""
+    module, _, name = COMMANDS[command].partition(".")
+    function: Callable[..., Any] = getattr(import_module(f"jaxslam.cli.{module}"), name)
+    return function
+
+
 def _usage(argv: list[str]) -> None:
     """Exit by `--help`, or by what is wrong: the arguments begin with no command."""
 
@@ -72,9 +75,7 @@ def _usage(argv: list[str]) -> None:
         stub.__doc__ = (function.__doc__ or "").splitlines()[0]
         return stub
 
-    commands: dict[str, Callable[..., Any]] = {
-        name: summary(function) for name, function in COMMANDS.items()
-    }
+    commands = {command: summary(function_of(command)) for command in COMMANDS}
     tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
 
 

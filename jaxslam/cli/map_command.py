@@ -8,13 +8,14 @@ from typing import Annotated, Literal
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import report, room_results, summaries
+from jaxslam.cli import map_files, room_results, summaries
 from jaxslam.cli.options import OutFolder, check_range, name_errors
 from jaxslam.core.maps import OccupancyMap
 from jaxslam.evaluation import map_metrics
-from jaxslam.io import graphml, ros_map
+from jaxslam.io import geojson, graphml, ros_map
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
+from jaxslam.io.route_graph import route_graph
 from jaxslam.mapping import grid_topology
 from jaxslam.mapping.planner_data import planner_data
 
@@ -34,8 +35,8 @@ def map_occupancy(
 ) -> None:
     """Extract the topological map, the rooms and the doors of an occupancy grid.
 
-    Writes metrics.json, map.geojson, map.graphml, map.lif.json and map.rmf.yaml, for fleets,
-    map.png, rooms.json and rooms.png, and the grid itself as map.yaml and map.pgm; needs the extras
+    Writes metrics.json, map.geojson, map.graphml, map.nav2.geojson, map.lif.json and map.rmf.yaml,
+    for robots and fleets, map.png, rooms.json and rooms.png, and the grid itself as map.yaml and map.pgm; needs the extras
     [ros] and [graph]. Rooms and doors keep their names of an earlier call with the same folder.
 
     Args:
@@ -90,11 +91,11 @@ def map_occupancy(
         numbers |= {"clearance_m": robot_radius, "seconds": seconds}
         write_json(out_dir / "metrics.json", numbers)
         data = planner_data(result.graph, grid, rooms)
-        report.write_map(out_dir / "map.geojson", result.graph, regions=rooms, planner=data)
+        geojson.write(out_dir / "map.geojson", *route_graph(result.graph, rooms, data))
         if not overwritten:
             ros_map.write(out_dir / "map.yaml", grid)
-        report.write_exports(out_dir, result.graph, rooms, data)
-        report.draw_map(out_dir / "map.png", grid, result.graph, rooms)
+        map_files.write_exports(out_dir, result.graph, rooms, data)
+        map_files.draw_map(out_dir / "map.png", grid, result.graph, rooms)
         bar.update()
     title = f"{map_file}: robot radius {robot_radius:g} m, regions {result.num_regions}"
     summaries.print_map_summary(numbers, title, out)

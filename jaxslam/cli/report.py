@@ -1,38 +1,27 @@
 """Files and figures of a result."""
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.cli import map_files
+from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.scan import Scan
-from jaxslam.evaluation.log_errors import Metrics
+from jaxslam.core.types import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract, lidar
-from jaxslam.io import (
-    g2o_writer,
-    geojson,
-    graphml,
-    lif,
-    map_file,
-    rmf_graph,
-    rooms_file,
-    ros_map,
-    tum,
-)
+from jaxslam.io import g2o_writer, geojson, map_file, ros_map, tum
 from jaxslam.io.annotated_map import AnnotatedMap
 from jaxslam.io.carry_over import carry_over
 from jaxslam.io.output import write_json, write_text
 from jaxslam.io.route_graph import route_graph
 from jaxslam.localisation.config import LocaliseInfo
 from jaxslam.mapping import pose_graph
-from jaxslam.mapping.planning import PlannedRoute
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.results import SlamResult
@@ -79,7 +68,7 @@ def write_maps(
     regions: Regions | None = None,
     planner: PlannerData | None = None,
 ) -> None:
-    """Write map.yaml, map.pgm, graph.g2o, map.npz and the files of `write_exports`.
+    """Write map.yaml, map.pgm, graph.g2o, map.npz and the files of `map_files.write_exports`.
 
     Args:
         out_dir: Folder to write to.
@@ -108,39 +97,19 @@ def write_maps(
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
     map_file.write(out_dir / map_file.NAME, kept)
-    write_exports(out_dir, result.topological_map, regions, planner)
-
-
-def write_exports(
-    out_dir: Path,
-    graph: TopologicalMap,
-    regions: Regions | None = None,
-    planner: PlannerData | None = None,
-) -> None:
-    """Write map.lif.json, map.rmf.yaml and, if networkx is installed, map.graphml.
-
-    Args:
-        out_dir: Folder to write to.
-        graph: The topological map.
-        regions: Its rooms and doors.
-        planner: Where its nodes and arcs lie.
-    """
-    lif.write(out_dir / "map.lif.json", graph, regions, planner)
-    rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner)
-    if find_spec("networkx") is not None:
-        graphml.write(out_dir / "map.graphml", graph, regions, planner)
+    map_files.write_exports(out_dir, result.topological_map, regions, planner)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
     """Draw the local Voronoi diagram of scan `number` of [T]."""
-    from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
+    from jaxslam.viz import canvas, landmarks  # imported here: matplotlib is slow to import
 
     scan = jax.tree.map(lambda leaf: leaf[number], scans)
     features, diagram, sources = jax.jit(extract.extract_diagram, static_argnums=0)(
         config.frontend, scan
     )
     figure, axes = canvas.canvas(8.0, 4.6)
-    maps.draw_local_diagram(axes[0, 0], diagram, sources, config.frontend.grid, features)
+    landmarks.draw_local_diagram(axes[0, 0], diagram, sources, config.frontend.grid, features)
     axes[0, 0].set_title(f"scan {number}")
     canvas.legend(figure)
     figure.savefig(path)
@@ -203,7 +172,7 @@ def draw(
         wrong: First and last number of scans where the map contradicts itself.
     """
     # Imported here, because matplotlib is slow to import.
-    from jaxslam.viz import canvas, charts, maps
+    from jaxslam.viz import canvas, charts, landmarks, maps
 
     poses = result.poses
     walls = [] if world is None else [np.reshape(world.walls, (-1, 2))]
@@ -227,7 +196,7 @@ def draw(
         maps.draw_trajectory(axis, line, what)
     maps.draw_wrong_parts(axis, poses, wrong)
     maps.draw_arcs(axis, result.topological_map)
-    maps.draw_landmarks(axis, result.belief, confirm_count=config.filter.confirm_count)
+    landmarks.draw_landmarks(axis, result.belief, confirm_count=config.filter.confirm_count)
     maps.draw_start_and_end(axis, poses[np.isfinite(poses).all(axis=1)])
     canvas.legend(figure)
     figure.savefig(out_dir / "path.png")
@@ -267,45 +236,4 @@ def draw_localisation(path: Path, saved_map: SavedMap, infos: LocaliseInfo) -> N
     figure, axis = canvas.map_canvas(*canvas.extent(saved_map.poses))
     maps.draw_hits(axis, saved_map.poses, np.asarray(points), np.asarray(scans.hit))
     maps.draw_probable_poses(axis, infos.pose, infos.probability)
-    figure.savefig(path)
-
-
-def draw_map(
-    path: Path, occupancy: OccupancyMap, graph: TopologicalMap, regions: Regions | None = None
-) -> None:
-    """Draw an occupancy grid with its topological map, its rooms and its doors."""
-    # Imported here, because matplotlib is slow to import.
-    from jaxslam.viz import canvas, maps, rooms
-
-    figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
-    maps.draw_occupancy(axis, occupancy)
-    if regions is not None:
-        rooms.draw_rooms(axis, regions, rooms_file.region_colours(regions))
-    maps.draw_topological_map(axis, graph)
-    canvas.legend(figure)
-    figure.savefig(path)
-
-
-def draw_route(
-    path: Path,
-    graph: TopologicalMap,
-    planned: PlannedRoute,
-    *,
-    occupancy: OccupancyMap | None = None,
-    regions: Regions | None = None,
-) -> None:
-    """Draw a route over a topological map, and over the occupancy map and the rooms if known."""
-    # Imported here, because matplotlib is slow to import.
-    from jaxslam.viz import canvas, maps, routes
-
-    corners = np.zeros((0, 2)) if occupancy is None else maps.known_corners(occupancy)
-    figure, axis = canvas.map_canvas(*canvas.extent(corners, graph.xy, planned.line))
-    if occupancy is not None:
-        maps.draw_occupancy(axis, occupancy)
-    if regions is not None:
-        routes.draw_regions(axis, regions)
-    maps.draw_arcs(axis, graph)
-    routes.draw_route(axis, planned)
-    maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
-    canvas.legend(figure)
     figure.savefig(path)

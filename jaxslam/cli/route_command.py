@@ -8,9 +8,11 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from jaxslam.cli import report, summaries
+from jaxslam.cli import summaries
 from jaxslam.cli.options import OutFolder, check_range
-from jaxslam.evaluation.summary import Metrics
+from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.regions import Regions
+from jaxslam.core.types import Metrics
 from jaxslam.io.errors import InputError
 from jaxslam.io.map_folder import MapFolder, read_map_folder
 from jaxslam.io.output import folder, write_json
@@ -77,7 +79,7 @@ def plan_route(
         content = _content(planned, known, legs) | {"goal_region": name}
         write_json(out_dir / "route.json", content | {"robot_radius_m": robot_radius})
         write_json(out_dir / "metrics.json", numbers)
-        report.draw_route(
+        draw_route(
             out_dir / "route.png",
             known.graph,
             planned,
@@ -86,6 +88,31 @@ def plan_route(
         )
     title = f"{map}: from {first[0]:g} {first[1]:g} to {where}, robot radius {robot_radius:g} m"
     summaries.print_route_summary(numbers, title, legs, out)
+
+
+def draw_route(
+    path: Path,
+    graph: TopologicalMap,
+    planned: PlannedRoute,
+    *,
+    occupancy: OccupancyMap | None = None,
+    regions: Regions | None = None,
+) -> None:
+    """Draw a route over a topological map, and over the occupancy map and the rooms if known."""
+    # Imported here, because matplotlib is slow to import.
+    from jaxslam.viz import canvas, maps, routes
+
+    corners = np.zeros((0, 2)) if occupancy is None else maps.known_corners(occupancy)
+    figure, axis = canvas.map_canvas(*canvas.extent(corners, graph.xy, planned.line))
+    if occupancy is not None:
+        maps.draw_occupancy(axis, occupancy)
+    if regions is not None:
+        routes.draw_regions(axis, regions)
+    maps.draw_arcs(axis, graph)
+    routes.draw_route(axis, planned)
+    maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))
+    canvas.legend(figure)
+    canvas.save(figure, path)
 
 
 def _point(option: str, words: tuple[str, ...]) -> np.ndarray:

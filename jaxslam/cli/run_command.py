@@ -9,28 +9,30 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, room_results, run_results, summaries
+from jaxslam.cli.log_options import (
+    Scanner,
+    ScannerOptions,
+    read_params,
+    require_beams,
+    require_odometry,
+)
 from jaxslam.cli.options import (
     FileOfEach,
     OptionalCount,
     OptionalFile,
     OptionalTopic,
     OutFolder,
-    Scanner,
-    ScannerOptions,
     check_range,
     name_errors,
-    read_params,
-    require_beams,
-    require_odometry,
-    stopwatch,
 )
 from jaxslam.cli.run_evaluation import RecordedDrive, without_errors
 from jaxslam.cli.run_results import RunContext
+from jaxslam.cli.stopwatch import stopwatch
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.log_errors import Trajectory
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import annotated_map, tum
@@ -80,8 +82,8 @@ def run(
 
     Every scan is matched; filter and maps are given keyframes, 0.3 m or 0.3 rad apart. Writes
     metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson, with
-    the extra [graph] as map.graphml, and for fleets as map.lif.json and map.rmf.yaml; its rooms and
-    doors as rooms.json and rooms.png; all drawn in map.png; an occupancy grid as map.yaml and
+    the extra [graph] as map.graphml, and in straight lanes, for robots and fleets, as
+    map.nav2.geojson, map.lif.json and map.rmf.yaml; its rooms and doors as rooms.json and rooms.png; all drawn in map.png; an occupancy grid as map.yaml and
     map.pgm, for map_server and `jaxslam map`; the pose graph graph.g2o, for batch optimisers; and
     map.npz, all that later sessions need of the map, for `jaxslam.load_map`. The pose of the first
     scan is the origin of the map. Where the map contradicts itself, loops are

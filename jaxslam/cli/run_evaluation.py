@@ -9,9 +9,9 @@ import numpy as np
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.se2_np import compose, relative
 from jaxslam.core.time_series import match_times
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import log_errors
 from jaxslam.evaluation.log_errors import Trajectory
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.pipeline.log_input import LogInput
 from jaxslam.pipeline.results import SlamResult
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli import report, room_results
+from jaxslam.cli import map_files, report, room_results
 from jaxslam.cli.run_evaluation import (
     RecordedDrive,
     breaks_of,
@@ -19,8 +19,8 @@ from jaxslam.core.measurement import Measurement
 from jaxslam.core.regions import Regions
 from jaxslam.core.se2_np import compose, relative, trajectories_as_one
 from jaxslam.core.time_series import match_times
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import log_errors
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.config import confirmed
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import tum
@@ -136,7 +136,7 @@ def write(
     planner = planner_data(graph, occupancy, rooms)
     numbers |= {"rooms": len(rooms.regions), "doors": len(rooms.doors)}
     report.write_results(out_dir, numbers, graph, old, next_id, rooms, planner)
-    report.draw_map(out_dir / "map.png", occupancy, graph, rooms)
+    map_files.draw_map(out_dir / "map.png", occupancy, graph, rooms)
     measurements = Measurement(
         jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
     )

@@ -10,14 +10,9 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.options import (
-    OptionalFile,
-    OutFolder,
-    check_range,
-    name_errors,
-    read_params,
-    stopwatch,
-)
+from jaxslam.cli.log_options import read_params
+from jaxslam.cli.options import OptionalFile, OutFolder, check_range, name_errors
+from jaxslam.cli.stopwatch import stopwatch
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.types import JUNCTION

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.evaluation.summary import Metrics
+from jaxslam.core.types import Metrics
 from jaxslam.io import noise_file
 
 SUMMARY_ROWS = (

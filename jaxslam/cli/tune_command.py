@@ -12,23 +12,22 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import summaries
+from jaxslam.cli.log_options import Scanner, ScannerOptions
 from jaxslam.cli.options import (
     Files,
     OptionalCount,
     OptionalFile,
     OutFolder,
-    Scanner,
-    ScannerOptions,
     check_range,
     name_errors,
-    stopwatch,
 )
+from jaxslam.cli.stopwatch import stopwatch
 from jaxslam.cli.tune_jobs import TuneJob, recorded_task, simulated_task
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.episode import Episode
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import summary
-from jaxslam.evaluation.summary import Metrics
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import checkpoint, noise_file
 from jaxslam.io.errors import InputError

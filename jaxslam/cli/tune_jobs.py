@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli.options import ScannerOptions, name_errors, read_params, require_odometry
+from jaxslam.cli.log_options import ScannerOptions, read_params, require_odometry
+from jaxslam.cli.options import name_errors
 from jaxslam.core import time_series
 from jaxslam.core.episode import Episode
 from jaxslam.core.logs import LaserLog

@@ -4,15 +4,15 @@
 everything else gives NumPy arrays. The other functions are for the host alone.
 """
 
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
-from jaxslam.core.types import AnyArray
+if TYPE_CHECKING:
+    import jax
 
-ArrayT = TypeVar("ArrayT", jax.Array, np.ndarray)
+ArrayT = TypeVar("ArrayT", "jax.Array", np.ndarray)
 
 DEFAULT_POINTS = 9
 """Points to which a polyline is resampled to be compared, and points of a driven arc."""
@@ -34,11 +34,11 @@ def resample(line: ArrayT, count: int = DEFAULT_POINTS) -> ArrayT:
     at_point = _cumulative_lengths(xp, points)
     if xp is np:
         return _interpolate(np, points, at_point, np.linspace(0.0, float(at_point[-1]), count))
-    fraction = jnp.linspace(0.0, 1.0, count, dtype=at_point.dtype)
-    return _interpolate(jnp, points, at_point, at_point[-1] * fraction)
+    fraction = xp.linspace(0.0, 1.0, count, dtype=at_point.dtype)
+    return _interpolate(xp, points, at_point, at_point[-1] * fraction)
 
 
-def points_along(line: ArrayT, distances: AnyArray) -> ArrayT:
+def points_along(line: ArrayT, distances: ArrayLike) -> ArrayT:
     """Points (N, 2) [m] at `distances` (N,) [m] along a polyline (n, 2) [m] from its first point.
 
     Distances below zero give the first point, those beyond the end the last one.
@@ -47,9 +47,10 @@ def points_along(line: ArrayT, distances: AnyArray) -> ArrayT:
     return _interpolate(xp, points, _cumulative_lengths(xp, points), xp.asarray(distances))
 
 
-def _module(line: AnyArray) -> tuple[Any, Any]:
-    """The array module of a polyline, and the polyline as its array."""
-    return (jnp, line) if isinstance(line, jax.Array) else (np, np.asarray(line))
+def _module(line: Any) -> tuple[Any, Any]:
+    """The array module of a polyline, as the array API standard has it, and its array."""
+    xp = getattr(line, "__array_namespace__", lambda: np)()
+    return xp, xp.asarray(line)
 
 
 def _cumulative_lengths(xp: Any, line: Any) -> Any:
@@ -92,11 +93,14 @@ def simplify(line: np.ndarray, tolerance: float) -> np.ndarray:
     kept, pieces = {0, len(line) - 1}, [(0, len(line) - 1)]
     while pieces:
         first, last = pieces.pop()
+        if last - first < 2:
+            continue
         step, offset = line[last] - line[first], line[first + 1 : last] - line[first]
-        share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+        share = offset @ step / max(float(step @ step), 1e-12)
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
         distance = np.hypot(offset[:, 0] - share * step[0], offset[:, 1] - share * step[1])
-        if distance.size and distance.max() > tolerance:
-            furthest = first + 1 + int(distance.argmax())
+        furthest = first + 1 + int(distance.argmax())
+        if distance[furthest - first - 1] > tolerance:
             kept.add(furthest)
             pieces += [(first, furthest), (furthest, last)]
     return line[sorted(kept)]

@@ -3,7 +3,8 @@
 import math
 from typing import NamedTuple
 
-from jaxslam.core.types import Array, as_bool, as_float, as_float64
+from jaxslam.core.arguments import as_bool, as_float
+from jaxslam.core.types import Array, as_float64
 
 
 class Lidar(NamedTuple):

@@ -20,26 +20,40 @@ Grids: cell [i, j] covers a square of the robot frame; i grows with x, j with y.
 """
 
 import operator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-Array = jax.Array
-"""Any array; its shape, unit and frame are in the docstring of what uses it."""
+if TYPE_CHECKING:
+    import jax
 
-AnyArray = jax.Array | np.ndarray
-"""An array of JAX or of NumPy, where both are taken as they are."""
+    Array = jax.Array
+    """Any array; its shape, unit and frame are in the docstring of what uses it."""
 
-Key = jax.Array
-"""A key made by `jax.random.key`."""
+    AnyArray = jax.Array | np.ndarray
+    """An array of JAX or of NumPy, where both are taken as they are."""
+
+    Key = jax.Array
+    """A key made by `jax.random.key`."""
+
+Metrics = dict[str, Any]
+"""Content of `metrics.json`, or a part of it."""
 
 JUNCTION, CORNER, WALL = 0, 1, 2
 """Kinds of landmarks: junction of the Voronoi diagram, corner of two walls, wall direction."""
 
 FAR_JUNCTION = 3
 """Kind of a feature that is no landmark: a junction that a coarser grid of the scan holds."""
+
+
+def __getattr__(name: str) -> Any:
+    """An alias of JAX's arrays; JAX is imported when one is first used, because that is slow."""
+    if name not in ("Array", "AnyArray", "Key"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import jax
+
+    globals().update(Array=jax.Array, AnyArray=jax.Array | np.ndarray, Key=jax.Array)
+    return globals()[name]
 
 
 def check_type(name: str, x: Any, wanted: type, *, advice: str = "") -> None:
@@ -62,12 +76,12 @@ def check_array(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> 
         name: Name of `x`, for the message.
         x: The array.
         shape: Its sizes; a string stands for any size, a leading `...` for any leading sizes.
-        kind: Its dtype or a family of dtypes such as `jnp.floating`; None for any.
+        kind: Its dtype or a family of dtypes such as `np.floating`; None for any.
 
     Raises:
         ValueError: Shape or dtype differ; the message states both.
     """
-    sizes, dtype = np.shape(x), x.dtype if hasattr(x, "dtype") else jnp.result_type(x)
+    sizes, dtype = np.shape(x), x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
     wanted_sizes = shape[1:] if shape[:1] == (...,) else shape
     num_leading = 0 if wanted_sizes is shape else max(0, len(sizes) - len(wanted_sizes))
     trailing = sizes[num_leading:]
@@ -75,34 +89,27 @@ def check_array(name: str, x: Any, shape: tuple[Any, ...], kind: Any = None) -> 
         isinstance(wanted, str) or size == wanted
         for size, wanted in zip(trailing, wanted_sizes, strict=True)
     )
-    if not fits or not (kind is None or jnp.issubdtype(dtype, kind)):
+    if not fits or not (kind is None or _is_kind(dtype, kind)):
         listed = ", ".join("..." if n is ... else str(n) for n in shape)
         listed += "," if len(shape) == 1 else ""
-        prefix = "" if kind is None else _dtype_name(kind) + " "
+        prefix = "" if kind is None else kind.__name__.rstrip("_") + " "
         raise ValueError(f"{name} is {dtype} {sizes}, not {prefix}({listed})")
 
 
-def as_float(name: str, x: Any, shape: tuple[Any, ...]) -> Array:
-    """A JAX array of floats made of a NumPy array, a list or a JAX array of numbers, checked.
+def as_float64(name: str, x: Any, shape: tuple[Any, ...]) -> np.ndarray:
+    """A NumPy array in float64 made of an array or a list of numbers, checked.
 
     Args:
         name: Name of `x`, for the message.
-        x: Numbers; what is not a JAX array of floats becomes one of JAX's default precision.
+        x: Numbers.
         shape: As of `check_array`.
 
     Raises:
         ValueError: It holds no numbers or has another shape; the message states both.
     """
-    x = _as_numbers(name, x)
-    if not (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)):
-        x = jnp.asarray(x, float)
-    check_array(name, x, shape, jnp.floating)
-    return x
-
-
-def as_float64(name: str, x: Any, shape: tuple[Any, ...]) -> np.ndarray:
-    """As `as_float`, but a NumPy array in float64, for what is computed on the host."""
-    x = np.asarray(_as_numbers(name, x), np.float64)
+    x = as_numpy(name, x)
+    check_numbers(name, x)
+    x = x.astype(np.float64, copy=False)
     check_array(name, x, shape)
     return x
 
@@ -125,74 +132,20 @@ def as_count(name: str, x: Any, *, least: int = 1) -> int:
     return number
 
 
-def as_bool(name: str, x: Any, shape: tuple[Any, ...]) -> Array:
-    """A JAX array of bools made of a NumPy array, a list or a JAX array of bools, checked.
-
-    Args:
-        name: Name of `x`, for the message.
-        x: Bools; numbers are refused.
-        shape: As of `check_array`.
-
-    Raises:
-        ValueError: It holds no bools or has another shape; the message states both.
-    """
-    x = as_array(name, x)
-    check_array(name, x, shape, jnp.bool_)
-    return jnp.asarray(x)
-
-
-def as_array(name: str, x: Any) -> AnyArray:
-    """An array made of anything array-like; raise ValueError, naming it, if it is none."""
-    if isinstance(x, jax.Array):
-        return x
+def as_numpy(name: str, x: Any) -> np.ndarray:
+    """A NumPy array made of anything array-like; raise ValueError, naming it, if it is none."""
     try:
         return np.asarray(x)
     except ValueError:
         raise ValueError(f"{name} is not an array: its parts differ in shape") from None
 
 
-def _as_numbers(name: str, x: Any) -> AnyArray:
-    """An array of floats or integers; raise ValueError if it is none."""
-    x = as_array(name, x)
-    if not (jnp.issubdtype(x.dtype, jnp.floating) or jnp.issubdtype(x.dtype, jnp.integer)):
+def check_numbers(name: str, x: Any) -> None:
+    """Raise ValueError, naming it, unless an array holds floats or integers."""
+    if not (_is_kind(x.dtype, np.floating) or _is_kind(x.dtype, np.integer)):
         raise ValueError(f"{name} is {x.dtype} {x.shape}, not numbers")
-    return x
 
 
-def _dtype_name(kind: Any) -> str:
-    """Name of a dtype or of a family of dtypes."""
-    return str(np.dtype(kind)) if kind is jnp.bool_ else kind.__name__
-
-
-def check_covariance(name: str, cov: Array, *, definite: bool = True) -> None:
-    """Check that covariance matrices are finite, symmetric and positive definite.
-
-    Nothing is checked while tracing, when there are no values.
-
-    Args:
-        name: Name of `cov`, for the message.
-        cov: (..., n, n) the matrices.
-        definite: False also accepts semi-definite ones: something known for certain.
-
-    Raises:
-        ValueError: One is not; the message states which, and why.
-    """
-    if isinstance(cov, jax.core.Tracer):
-        return
-    matrices = np.asarray(cov, float)
-    for index in np.ndindex(matrices.shape[:-2]):
-        matrix, label = matrices[index], name + (str(list(index)) if index else "")
-        if not np.isfinite(matrix).all():
-            raise ValueError(f"{label} holds numbers that are not finite")
-        scale = np.abs(matrix).max()
-        asymmetry = np.abs(matrix - matrix.T)
-        if asymmetry.max() > 1e-5 * scale:
-            i, j = np.unravel_index(np.argmax(asymmetry), matrix.shape)
-            upper, lower = matrix[i, j], matrix[j, i]
-            raise ValueError(
-                f"{label} is not symmetric: [{i}, {j}] is {upper:g}, [{j}, {i}] {lower:g}"
-            )
-        smallest = np.linalg.eigvalsh((matrix + matrix.T) / 2)[0]
-        if not (smallest > 0.0 if definite else smallest >= -1e-6 * scale):
-            wanted = "positive definite" if definite else "positive semi-definite"
-            raise ValueError(f"{label} is not {wanted}: its smallest eigenvalue is {smallest:g}")
+def _is_kind(dtype: Any, kind: Any) -> bool:
+    """Whether a dtype is `kind`, or of that family; NumPy has bfloat16 of JAX in no family."""
+    return np.issubdtype(np.float16 if dtype.name == "bfloat16" else dtype.type, kind)

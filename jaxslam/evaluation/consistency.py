@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
+from jaxslam.core.arguments import as_float
 from jaxslam.core.se2 import wrap_angle
-from jaxslam.core.types import AnyArray, Array, as_float
+from jaxslam.core.types import AnyArray, Array
 
 # Trace of the covariance below which a pose is known exactly, as the first of a drive is.
 CERTAIN_TRACE = 1e-12

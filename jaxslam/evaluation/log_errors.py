@@ -6,8 +6,8 @@ import numpy as np
 from jaxslam.core import time_series
 from jaxslam.core.logs import LaserLog, Relations
 from jaxslam.core.se2_np import relative
+from jaxslam.core.types import Metrics
 from jaxslam.evaluation import consistency, trajectory
-from jaxslam.evaluation.summary import Metrics as Metrics
 from jaxslam.pipeline.episodes import TrialResult
 
 NEED_HEADING = ("rpe_translation_rmse_m", "rpe_rotation_rmse_deg", "heading_rmse_deg")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxslam.evaluation.summary import Metrics
+from jaxslam.core.types import Metrics
 from jaxslam.mapping.grid_topology import GridTopology
 
 

@@ -5,13 +5,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.types import check_array
+from jaxslam.core.types import Metrics, check_array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, nees, nees_per_dof, pose_error
 from jaxslam.pipeline.episodes import TrialResult
-
-Metrics = dict[str, Any]
-"""Content of `metrics.json`, or a part of it."""
-
 
 DIVERGED_DISTANCE = 1.0
 """Position error [m] at the end of a trial beyond which it has diverged."""

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxslam.core.arguments import as_float, check_covariance
 from jaxslam.core.features import Features
-from jaxslam.core.types import CORNER, JUNCTION, Array, as_float, check_covariance
+from jaxslam.core.types import CORNER, JUNCTION, Array
 from jaxslam.filtering.covariance import DeferredCovariance, flush
 
 

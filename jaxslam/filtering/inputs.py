@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.arguments import as_float
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement, ScanMatch
-from jaxslam.core.types import Array, as_float, check_array, check_type
+from jaxslam.core.types import Array, check_array, check_type
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.noise import NoiseParams
 

@@ -45,8 +45,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.core.arguments import as_array, as_bool
 from jaxslam.core.batching import sequential_vmap_on_cpu
-from jaxslam.core.types import Array, as_array, as_bool, check_array
+from jaxslam.core.types import Array, check_array
 
 
 class Diagram(NamedTuple):

@@ -2,7 +2,8 @@
 
 import jax.numpy as jnp
 
-from jaxslam.core.types import Array, as_bool
+from jaxslam.core.arguments import as_bool
+from jaxslam.core.types import Array
 from jaxslam.frontend.automaton import neighbours
 from jaxslam.frontend.grid import Grid, GridSpec, centres, check_grid_spec
 

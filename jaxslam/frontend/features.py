@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxslam.core.arguments import as_bool, as_float
 from jaxslam.core.features import Features, zero_padding
 from jaxslam.core.se2 import cross, dot, unit_vector, wrap_angle, wrap_direction
-from jaxslam.core.types import CORNER, JUNCTION, WALL, Array, as_bool, as_float
+from jaxslam.core.types import CORNER, JUNCTION, WALL, Array
 from jaxslam.frontend.segments import Segments
 
 

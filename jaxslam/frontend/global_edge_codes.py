@@ -7,7 +7,8 @@ compares itself with has twelve codes.
 
 import jax.numpy as jnp
 
-from jaxslam.core.types import Array, as_bool
+from jaxslam.core.arguments import as_bool
+from jaxslam.core.types import Array
 from jaxslam.frontend.automaton import neighbours
 
 # Code of each pattern of occupied neighbours, bits N=1 E=2 S=4 W=8, north being the next row and

@@ -4,9 +4,10 @@ import math
 
 import jax.numpy as jnp
 
+from jaxslam.core.arguments import as_float
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import unit_vector
-from jaxslam.core.types import Array, as_float
+from jaxslam.core.types import Array
 
 
 def beam_angles(lidar: Lidar) -> Array:

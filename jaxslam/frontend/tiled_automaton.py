@@ -22,7 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.types import AnyArray, Array, as_bool
+from jaxslam.core.arguments import as_bool
+from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.automaton import Diagram, as_labels, expand
 
 TILE = 64  # [cells] side of a tile

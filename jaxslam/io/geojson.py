@@ -132,6 +132,7 @@ def _check(nodes: Sequence[Node], arcs: Sequence[Arc]) -> None:
     for what, ids in (("node", node_ids), ("arc", [int(arc.id) for arc in arcs])):
         if len(set(ids)) != len(ids) or min(ids, default=0) < 0:
             raise ValueError(f"{what} ids must differ and not be negative: {sorted(ids)}")
+    known = set(node_ids)
     for node in nodes:
         if not (math.isfinite(node.x) and math.isfinite(node.y)):
             raise ValueError(f"node {node.id} is at ({node.x}, {node.y})")
@@ -141,7 +142,7 @@ def _check(nodes: Sequence[Node], arcs: Sequence[Arc]) -> None:
             raise ValueError(f"arc {arc.id} has points {points.shape}, not (k >= 2, 2)")
         if not np.isfinite(points).all() or not math.isfinite(arc.length):
             raise ValueError(f"arc {arc.id} has a point or length that is not finite")
-        if not {int(arc.start), int(arc.end)} <= set(node_ids):
+        if not {int(arc.start), int(arc.end)} <= known:
             raise ValueError(f"arc {arc.id} joins {arc.start} and {arc.end}, not both nodes")
 
 
@@ -176,7 +177,7 @@ def _edge_feature(
     return {
         "type": "Feature",
         "properties": _merged(properties, _added(own, arc.metadata, arc.operations)),
-        "geometry": {"type": "MultiLineString", "coordinates": [points.tolist()]},
+        "geometry": {"type": "MultiLineString", "coordinates": [points]},
     }
 
 

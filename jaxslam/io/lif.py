@@ -26,6 +26,7 @@ def write(
     regions: Regions | None = None,
     planner: PlannerData | None = None,
     *,
+    lanes: StraightLanes | None = None,
     max_speed: float = 1.0,
     vehicle_type: str = "robot",
     project: str = "map",
@@ -38,6 +39,7 @@ def write(
         graph: The map.
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
+        lanes: As `straight_lanes` gives them for these; None to have them computed.
         max_speed: [m/s] full speed.
         vehicle_type: `vehicleTypeId` of the vehicles that may drive there.
         project: Name of the project, of the layout and of the map.
@@ -47,7 +49,7 @@ def write(
         ValueError: The map has no numbers of its shapes, or `planner` is of another map.
         InputError: The file cannot be written.
     """
-    layout = straight_lanes(graph, regions, planner)
+    layout = straight_lanes(graph, regions, planner) if lanes is None else lanes
     stamp = (datetime.now(UTC) if time is None else time.astimezone(UTC)).replace(tzinfo=None)
     content = {
         "metaInformation": {

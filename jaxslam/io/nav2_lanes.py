@@ -2,7 +2,7 @@
 
 nav2_route leads a robot straight from node to node: the polylines of `map.geojson` are not driven.
 Here the points of `straight_lanes` are nodes, so that no edge is farther than a tolerance from its
-arc. Nodes of the map keep their ids, `metadata.map_arc` is the arc of the map, and a door is opened
+arc. The map's nodes keep their ids, `metadata.map_arc` is the arc of the map, and a door is opened
 by the short edge that passes through it.
 """
 

@@ -11,7 +11,6 @@ from os import PathLike
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.io.errors import InputError
@@ -79,7 +78,7 @@ def read(path: str | PathLike, template: Noise) -> Noise:
             in the file, and stays None.
 
     Returns:
-        A record of the template's type.
+        A record of the template's type, of NumPy arrays.
 
     Raises:
         InputError: The file cannot be read, is no such file, lacks a key, has an unknown one, or
@@ -129,7 +128,7 @@ def _parse_field(path: str | PathLike, key: str, value: Any, like: Any) -> Any:
     if array.dtype.kind not in "fiu" or array.shape != like.shape:
         raise InputError(f"is not {form}", path=path, field=key, advice=f"give {form}")
     _check_values(path, key, array.astype(np.float64))
-    return jnp.asarray(array.astype(like.dtype))
+    return array.astype(like.dtype)
 
 
 def _check_values(path: str | PathLike, key: str, array: np.ndarray) -> None:

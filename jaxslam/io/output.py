@@ -124,13 +124,14 @@ def write_json_rows(path: str | PathLike, members: Mapping[str, Any]) -> None:
 
     It is several times as fast, and the file is smaller.
     """
+    encode = json.JSONEncoder(allow_nan=False).encode
     text = []
     for name, member in plain(members).items():
-        own = json.dumps(member, allow_nan=False)
         if isinstance(member, list) and member:
-            rows = [json.dumps(row, allow_nan=False) for row in member]
-            own = "[\n" + ",\n".join(rows) + "\n]"
-        text.append(f"{json.dumps(name)}: {own}")
+            own = "[\n" + ",\n".join(map(encode, member)) + "\n]"
+        else:
+            own = encode(member)
+        text.append(f"{encode(name)}: {own}")
     write_text(path, "{\n" + ",\n".join(text) + "\n}\n")
 
 
@@ -153,7 +154,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if hasattr(value, "__array__"):
-        return plain(np.asarray(value).tolist())
+        array = np.asarray(value)
+        is_plain = array.dtype.kind in "biu" or (array.dtype == float and np.isfinite(array).all())
+        return array.tolist() if is_plain else plain(array.tolist())
     if isinstance(value, PathLike):
         return str(value)
     raise TypeError(f"{type(value).__name__} has no JSON form")

@@ -14,7 +14,7 @@ from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.io.output import write_text
 from jaxslam.io.route_labels import has_leaf
-from jaxslam.io.straight_lanes import Lane, straight_lanes
+from jaxslam.io.straight_lanes import Lane, StraightLanes, straight_lanes
 
 
 def write(
@@ -23,6 +23,7 @@ def write(
     regions: Regions | None = None,
     planner: PlannerData | None = None,
     *,
+    lanes: StraightLanes | None = None,
     max_speed: float = 1.0,
     building: str = "map",
     level: str = "L1",
@@ -34,6 +35,7 @@ def write(
         graph: The map.
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
+        lanes: As `straight_lanes` gives them for these; None to have them computed.
         max_speed: [m/s] full speed; lanes of full speed have no limit.
         building: Name of the building.
         level: Name of the level, which Open-RMF also calls the map.
@@ -42,7 +44,7 @@ def write(
         ValueError: The map has no numbers of its shapes, or `planner` is of another map.
         InputError: The file cannot be written.
     """
-    found = straight_lanes(graph, regions, planner)
+    found = straight_lanes(graph, regions, planner) if lanes is None else lanes
     doors = () if regions is None else tuple(d for d in regions.doors if has_leaf(d))
     text = [f"building_name: {_quoted(building)}"]
     text.append("doors:" if doors else "doors: {}")

@@ -90,10 +90,20 @@ def region_colours(regions: Regions) -> np.ndarray:
         hue, shade = (0.6180339887 * number) % 1.0, number // 7 % 3
         level = colorsys.hsv_to_rgb(hue, (0.45, 0.6, 0.3)[shade], (0.95, 0.8, 0.88)[shade])
         colour = tuple(round(255.0 * x) for x in level)
-        while colour in found:  # all levels stay between 1 and 254
-            colour = (colour[0], colour[1], colour[2] % 254 + 1)
+        while colour in found:
+            colour = _next_colour(colour)
         found[colour] = None
     return np.array(list(found), np.uint8).reshape(-1, 3)
+
+
+def _next_colour(colour: tuple[int, ...]) -> tuple[int, ...]:
+    """The colour after another; blue counts fastest, and all levels stay between 1 and 254."""
+    levels = list(colour)
+    for channel in (2, 1, 0):
+        levels[channel] = levels[channel] % 254 + 1
+        if levels[channel] > 1:
+            break
+    return tuple(levels)
 
 
 def read_rooms(path: str | PathLike) -> Regions:

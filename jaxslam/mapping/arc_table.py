@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jax import lax
 from numpy.typing import ArrayLike
 
+from jaxslam.core.arguments import as_float
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import inverse_transform, transform, unit_vector
-from jaxslam.core.types import Array, as_float, check_array
+from jaxslam.core.types import Array, check_array
 from jaxslam.filtering.map_management import claim_slots
 from jaxslam.frontend.arc_tracing import POLYLINE_POINTS
 from jaxslam.frontend.lidar import in_free_view

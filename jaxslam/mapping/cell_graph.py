@@ -145,12 +145,14 @@ def _node_cells(
     """
     node_of = {cell: cell for cell in range(len(height)) if len(neighbours[cell]) != 2}
     corners = [_shifted(number, row, column) for row, column in ((0, 0), (1, 0), (0, 1), (1, 1))]
-    block = np.stack(corners, axis=-1)
-    for square in block[(block >= 0).all(axis=-1)].tolist():
+    is_square = np.logical_and.reduce([corner >= 0 for corner in corners])
+    members = {cell: [cell] for cell in node_of}  # of each node
+    for square in np.stack([corner[is_square] for corner in corners], axis=-1).tolist():
         united = {node_of.get(cell, cell) for cell in square}
         best = max(united, key=lambda cell: (height[cell], -cell))
-        members = [cell for cell, node in node_of.items() if node in united]
-        node_of |= dict.fromkeys([*square, *members], best)
+        cells = dict.fromkeys(square) | {c: None for node in united for c in members.pop(node, ())}
+        members[best] = list(cells)
+        node_of |= dict.fromkeys(cells, best)
     return node_of
 
 

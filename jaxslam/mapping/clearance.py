@@ -7,7 +7,6 @@ beyond the grid. Unknown cells are none, but a robot's centre stays out of them.
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.se2_np import inverse_transform, transform
@@ -58,7 +57,7 @@ def clearance_field(occupancy: OccupancyMap) -> ClearanceField:
         min_unknown_size=MIN_UNKNOWN_SIZE / resolution,
     )
     open_cells = np.pad(free | ~occupancy.occupied, 1)
-    to_centre, foot = ndimage.distance_transform_edt(open_cells, return_indices=True)
+    to_centre, foot = medial_axis.nearest_obstacles(open_cells)
     return ClearanceField(
         free=free,
         distance=np.maximum(to_centre[1:-1, 1:-1] - 0.5, 0.0) * resolution,

@@ -37,9 +37,9 @@ def find_doors(
         nearest: (2, H, W) int index of that obstacle.
         resolution: [m] side of a cell.
     """
-    passages = Passages(find_gaps(free, distance, nearest))
+    passages = Passages(find_gaps(free, distance, nearest), WALL / resolution)
     widths = passages.gaps.width
-    tried = narrowest(passages, max_width=MAX_WIDTH / resolution, wall=WALL / resolution)
+    tried = narrowest(passages, max_width=MAX_WIDTH / resolution)
     search = _Search(free, passages, resolution)
     # Closing doors makes space narrower: what does not widen now never does.
     widens = search.widens(tried)
@@ -72,7 +72,6 @@ class _Search:
         self._passages = passages
         self._gaps = passages.gaps
         self._normal = passages.gaps.normal
-        self._wall = WALL / resolution
         self._ahead = np.arange(1.0, REACH / resolution + 0.5)  # [cells]
         # The margin holds all points that are looked up.
         self._margin = int(HALL_RANGE * MAX_WIDTH / resolution) + 2
@@ -91,8 +90,7 @@ class _Search:
     def _frame(self, k: int) -> np.ndarray:
         """Cells (n,) of a gap and of those beside it in the same passage, as flat indices."""
         if k not in self._frames:
-            beside = self._passages.beside(k, self._wall)
-            lines = [line_cells(self._gaps.feet[other]) for other in beside]
+            lines = [line_cells(self._gaps.feet[other]) for other in self._passages.frame(k)]
             row, column = np.concatenate(lines).T + self._margin
             self._frames[k] = np.unique(row * self._obstacles.shape[1] + column)
         return self._frames[k]
@@ -139,7 +137,7 @@ class _Search:
         centre = gaps.middle[chosen][:, None, None] + ahead[:, None] * forward[:, :, None]
         along = gaps.along[chosen][:, None] * np.array([1.0, -1.0])[:, None]
         offset = along[:, None, None, :, None] * steps[:, None]
-        row, column = np.moveaxis(centre[:, :, :, None, None] + offset, -1, 0)
+        row, column = (centre[..., None, None, axis] + offset[..., axis] for axis in range(2))
         is_free = self._is_free(row, column)
         reached = np.logical_and.accumulate(is_free[..., 0, 0], axis=2)
         blocked = ~is_free

@@ -84,10 +84,18 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
 class Passages:
     """Gaps that can be looked up by their place."""
 
-    def __init__(self, gaps: Gaps):
-        """Index all gaps of a map by their middles."""
+    def __init__(self, gaps: Gaps, wall: float):
+        """Index all gaps of a map by their middles; `wall` [cells] is the depth of a door frame."""
         self.gaps = gaps
         self._tree = cKDTree(gaps.middle)
+        pairs = self._tree.query_pairs(wall, output_type="ndarray")
+        itself = np.arange(len(gaps.width))
+        first = np.concatenate([pairs[:, 0], pairs[:, 1], itself])
+        second = np.concatenate([pairs[:, 1], pairs[:, 0], itself])
+        same = self._in_one_passage(first, second)
+        first, second = first[same], second[same]
+        self._in_frame = second[np.lexsort((second, first))]
+        self._frame_of = np.searchsorted(np.sort(first), np.arange(len(gaps.width) + 1)).tolist()
 
     def near(self, middle: np.ndarray, radius: float) -> list[int]:
         """Indices of gaps whose middle is within a radius [cells] of a point (2,)."""
@@ -99,16 +107,25 @@ class Passages:
         They are within a radius [cells], parallel to it, in front of or behind it, and at most
         `PASSAGE_WIDENING` times as wide.
         """
-        gaps = self.gaps
-        near = np.array(sorted(self.near(gaps.middle[k], radius)))
-        parallel = np.abs(gaps.along[near] @ gaps.along[k]) > 0.9
-        sideways = np.abs((gaps.middle[near] - gaps.middle[k]) @ gaps.along[k])
-        same = parallel & (sideways <= 0.25 * gaps.width[k] + 1.0)
-        same &= gaps.width[near] <= PASSAGE_WIDENING * gaps.width[k] + 1.0
-        return near[same | (near == k)]
+        near = np.array(sorted(self.near(self.gaps.middle[k], radius)))
+        return near[self._in_one_passage(np.full(len(near), k), near)]
+
+    def frame(self, k: int) -> np.ndarray:
+        """As `beside`, within the depth of a door frame."""
+        return self._in_frame[self._frame_of[k] : self._frame_of[k + 1]]
+
+    def _in_one_passage(self, k: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Whether gaps `other` (n,) are in front of or behind the gaps k (n,), or these."""
+        (along_x, along_y), width = self.gaps.along[k].T, self.gaps.width[k]
+        other_x, other_y = self.gaps.along[other].T
+        x, y = (self.gaps.middle[other] - self.gaps.middle[k]).T
+        same = np.abs(other_x * along_x + other_y * along_y) > 0.9
+        same &= np.abs(x * along_x + y * along_y) <= 0.25 * width + 1.0
+        same &= self.gaps.width[other] <= PASSAGE_WIDENING * width + 1.0
+        return same | (other == k)
 
 
-def narrowest(passages: Passages, *, max_width: float, wall: float) -> np.ndarray:
+def narrowest(passages: Passages, *, max_width: float) -> np.ndarray:
     """Indices (n,) of the gaps to try as doors, narrow ones first.
 
     Of gaps nearer to each other than half their width one is kept: the narrowest, or the middle
@@ -117,7 +134,6 @@ def narrowest(passages: Passages, *, max_width: float, wall: float) -> np.ndarra
     Args:
         passages: All gaps of a map.
         max_width: [cells] of the widest.
-        wall: [cells] thickness of a thick wall.
     """
     gaps = passages.gaps
     order = np.lexsort((*gaps.middle.T, gaps.width))
@@ -126,13 +142,13 @@ def narrowest(passages: Passages, *, max_width: float, wall: float) -> np.ndarra
     for k in order.tolist():
         if tried[k]:
             continue
-        beside = passages.beside(k, wall)
-        beside = beside[gaps.width[beside] <= gaps.width[k] + 1.0]
-        beside = beside[~tried[beside]]
-        centre = gaps.middle[beside].mean(axis=0)
-        best = int(beside[np.hypot(*(gaps.middle[beside] - centre).T).argmin()])
+        beside = passages.frame(k)
+        beside = beside[(gaps.width[beside] <= gaps.width[k] + 1.0) & ~tried[beside]]
+        middle = gaps.middle[beside]
+        offset = middle - middle.sum(axis=0) / len(middle)
+        best = int(beside[np.hypot(offset[:, 0], offset[:, 1]).argmin()])
         kept.append(best)
-        for done in (best, k):
+        for done in {best, k}:
             tried[passages.near(gaps.middle[done], max(0.5 * gaps.width[done], 3.0))] = True
     chosen = np.array(kept, int)
     return chosen[np.argsort(gaps.width[chosen], kind="stable")]

@@ -11,7 +11,6 @@ Two nodes may be joined by several arcs, and a ring without a junction is one no
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
@@ -82,8 +81,8 @@ def extract_topology(
         ValueError: The robot fits nowhere, or an argument has another type, shape or range.
     """
     occupied, free = np.asarray(occupied), np.asarray(free)
-    check_array("occupied", occupied, ("H", "W"), jnp.bool_)
-    check_array("free", free, occupied.shape, jnp.bool_)
+    check_array("occupied", occupied, ("H", "W"), np.bool_)
+    check_array("free", free, occupied.shape, np.bool_)
     origin = as_float64("origin", origin, (3,))
     _check_sizes(resolution, robot_radius, min_obstacle_size, min_region_area)
     callback(STAGES[0])
@@ -169,14 +168,8 @@ def line_clearances(
     lines: Sequence[np.ndarray], space: FreeConfigurations, resolution: float, corner: np.ndarray
 ) -> np.ndarray:
     """Smallest distance (A,) [m] from polylines (n, 2) [m] to the edge of an obstacle."""
-    return np.array(
-        [
-            resolution
-            * _smallest_clearance((line - corner) / resolution - 0.5, space.nearest_obstacle)
-            for line in lines
-        ],
-        float,
-    )
+    in_cells = [(line - corner) / resolution - 0.5 for line in lines]
+    return resolution * _smallest_clearances(in_cells, space.nearest_obstacle)
 
 
 def _to_map(
@@ -194,7 +187,7 @@ def _to_map(
 
     arcs = list(cell_graph.arcs.values())
     lines = tuple(to_map(arc.line) for arc in arcs)
-    clearances = [_smallest_clearance(arc.line, space.nearest_obstacle) for arc in arcs]
+    clearances = _smallest_clearances([arc.line for arc in arcs], space.nearest_obstacle)
     return TopologicalMap(
         id=np.arange(len(names)),
         xy=to_map(cells),
@@ -202,21 +195,29 @@ def _to_map(
         clearance=space.distance[tuple(cells.T)] * resolution,
         arc_ends=np.array([[index[node] for node in arc.ends] for arc in arcs], int).reshape(-1, 2),
         arc_length=np.array([polylines.length(line) for line in lines], float),
-        arc_clearance=resolution * np.array(clearances),
+        arc_clearance=resolution * clearances,
         arc_lines=lines,
     )
 
 
-def _smallest_clearance(line: np.ndarray, foot: np.ndarray) -> float:
-    """Smallest distance [cells] from a polyline to the edge of an obstacle.
+def _smallest_clearances(lines: Sequence[np.ndarray], foot: np.ndarray) -> np.ndarray:
+    """Smallest distance (A,) [cells] from polylines to the edge of an obstacle.
 
-    The polyline is sampled every quarter of a cell.
+    The polylines are sampled every quarter of a cell.
 
     Args:
-        line: (n, 2) [cells].
+        lines: A polylines (n, 2) [cells].
         foot: (2, H, W) index of the nearest obstacle of each cell.
     """
+    if not lines:
+        return np.zeros(0)
+    samples = [_sampled(line) for line in lines]
+    first = np.cumsum([0, *map(len, samples[:-1])])
+    return np.minimum.reduceat(obstacle_distance(np.concatenate(samples), foot), first)
+
+
+def _sampled(line: np.ndarray) -> np.ndarray:
+    """Points (m, 2) of a polyline (n, 2) [cells], those every quarter of a cell among them."""
     at_point = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     wanted = np.unique(np.concatenate([at_point, np.arange(0.0, at_point[-1], 0.25)]))
-    samples = np.column_stack([np.interp(wanted, at_point, line[:, axis]) for axis in range(2)])
-    return float(obstacle_distance(samples, foot).min())
+    return np.column_stack([np.interp(wanted, at_point, line[:, axis]) for axis in range(2)])

@@ -67,6 +67,18 @@ def free_space(
     return free | filled[island]
 
 
+def nearest_obstacles(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (H, W) [cells] of cells (H, W) to the nearest one that is not free, and its index.
+
+    Returns:
+        (H, W) float64 between the centres of the cells, and (2, H, W) int32.
+    """
+    nearest = ndimage.distance_transform_edt(free, return_distances=False, return_indices=True)
+    distance = np.square(nearest[0] - np.arange(free.shape[0], dtype=float)[:, None])
+    distance += np.square(nearest[1] - np.arange(free.shape[1], dtype=float))
+    return np.sqrt(distance, out=distance), nearest
+
+
 def free_configurations(
     free: np.ndarray, *, clearance: float, also_free: np.ndarray | None = None
 ) -> FreeConfigurations:
@@ -77,7 +89,7 @@ def free_configurations(
         clearance: [cells] radius of the robot.
         also_free: (H, W) bool, cells of `free` where the robot fits, as it was there.
     """
-    to_centre, foot = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
+    to_centre, foot = nearest_obstacles(np.pad(free, 1))
     to_edge = to_centre[1:-1, 1:-1] - 0.5
     fits = to_edge >= clearance
     if also_free is not None:
@@ -128,9 +140,12 @@ def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) 
     distance = space.distance + 0.5
     for low, high in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
         row, column = space.nearest_obstacle
-        apart = np.hypot(row[low] - row[high], column[low] - column[high])
-        between = apart >= 2 * np.sin(0.5 * angle) * np.maximum(distance[low], distance[high])
-        between &= inside[low] & inside[high] & (is_wall[low] | is_wall[high])
+        step = row[low] - row[high], column[low] - column[high]
+        between = inside[low] & inside[high] & (is_wall[low] | is_wall[high])
+        between &= (step[0] != 0) | (step[1] != 0)
+        larger = np.maximum(distance[low][between], distance[high][between])
+        apart = np.hypot(step[0][between], step[1][between])
+        between[between] = apart >= 2 * np.sin(0.5 * angle) * larger
         high_is_farther = distance[high] > distance[low]
         anchors[low] |= between & ~high_is_farther
         anchors[high] |= between & high_is_farther
@@ -148,7 +163,7 @@ def _few(anchors: np.ndarray, distance: np.ndarray) -> np.ndarray:
     group = np.where(anchors, group, 0)
     count = np.bincount(group.ravel())
     farthest = np.zeros(len(count))
-    np.maximum.at(farthest, group.ravel(), distance.ravel())
+    np.maximum.at(farthest, group[anchors], distance[anchors])
     return anchors & ((count < MIN_RUN) & (farthest < COARSE_DISTANCE))[group]
 
 
@@ -230,7 +245,7 @@ def _thin(cells: np.ndarray, level: np.ndarray, kept: np.ndarray, *, ends: bool)
     width = cells.shape[1] + 2
     is_set = np.pad(cells, 1).ravel()
     removable = is_set & ~np.pad(kept, 1).ravel()
-    level = np.pad(level, 1).ravel()
+    level = np.where(removable, np.pad(level, 1).ravel(), np.iinfo(level.dtype).max)
     parity = np.add.outer(2 * (np.arange(cells.shape[0] + 2) % 2), np.arange(width) % 2).ravel()
     offsets = np.array([row * width + column for row, column in _ROUND])
     bits = 1 << np.arange(8)
@@ -246,6 +261,6 @@ def _thin(cells: np.ndarray, level: np.ndarray, kept: np.ndarray, *, ends: bool)
                 remove = _SIMPLE[pattern] & ~(ends & (_COUNT[pattern] == 1))
                 is_set[tried[remove]] = False
                 removed.append(tried[remove])
-            beside = np.unique(np.concatenate(removed)[:, None] + offsets)
-            pending = beside[is_set[beside] & removable[beside] & (level[beside] <= current)]
+            beside = (np.concatenate(removed)[:, None] + offsets).ravel()
+            pending = np.unique(beside[is_set[beside] & (level[beside] <= current)])
     return is_set.reshape(-1, width)[1:-1, 1:-1]

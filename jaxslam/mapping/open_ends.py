@@ -28,7 +28,7 @@ _NEIGHBOURS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 
 def find_open_ends(
     graph: PlaneGraph, space: FreeSpace, occupancy: OccupancyMap
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Open ends of a graph, whose arcs are split where the way to one begins.
+    """Open ends of a graph, whose arcs are split where the path to one begins.
 
     Args:
         graph: The graph; all its arcs lie in the free space.

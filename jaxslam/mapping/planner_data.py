@@ -1,6 +1,7 @@
 """What a planner needs of nodes and arcs: their regions, the doors on arcs, width profiles."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
@@ -28,20 +29,24 @@ def planner_data(
     check_types(graph, occupancy, regions)
     lines = graph.arc_lines
     places = [polylines.resample(line, 2 + int(polylines.length(line) / SPACING)) for line in lines]
-    widths = clearance_at(clearance_field(occupancy), np.concatenate([np.zeros((0, 2)), *places]))
     last = np.cumsum([len(along) for along in places], dtype=int)
+    points = np.concatenate([np.zeros((0, 2)), *places])
+    widths = np.split(clearance_at(clearance_field(occupancy), points), last[:-1])
     node_region, arc_region = np.full(len(graph.xy), -1), np.full(len(lines), -1)
     arc_doors: list[tuple[int, ...]] = [()] * len(lines)
+    if regions is not None and lines:
+        found = np.split(region_at(regions, points), last[:-1])
+        arc_region = np.array([most_common(part) for part in found])
+        segments = _segments(regions.doors)
+        for k, (line, near) in enumerate(zip(lines, _doors_near(segments, lines), strict=True)):
+            arc_doors[k] = tuple(near[door] for _, door in _crossed(segments[near], line))
     if regions is not None:
         node_region = region_at(regions, graph.xy)
-        for k, (line, along) in enumerate(zip(lines, places, strict=True)):
-            arc_region[k] = most_common(region_at(regions, along))
-            arc_doors[k] = tuple(door for _, door in doors_crossed(regions.doors, line))
     return PlannerData(
         node_region=node_region,
         arc_region=arc_region,
         arc_doors=tuple(arc_doors),
-        arc_widths=tuple(np.split(widths, last[:-1])) if lines else (),
+        arc_widths=tuple(widths) if lines else (),
     )
 
 
@@ -96,12 +101,32 @@ def doors_crossed(doors: tuple[Door, ...], line: np.ndarray) -> list[tuple[int, 
     Returns:
         For each, the index of the polyline's segment and that of the door.
     """
-    if not doors:
-        return []
-    low, high = np.array([door.jambs for door in doors], float).swapaxes(0, 1)  # each (D, 2)
+    return _crossed(_segments(doors), line)
+
+
+def _segments(doors: tuple[Door, ...]) -> np.ndarray:
+    """Ends (D, 2, 2) [m, map frame] of the lines across doors, longer by `DOOR_MARGIN` each."""
+    low, high = np.array([door.jambs for door in doors], float).reshape(-1, 2, 2).swapaxes(0, 1)
     width = np.hypot(*(high - low).T)[:, None]
     across = DOOR_MARGIN * (high - low) / np.maximum(width, 1e-9)
-    low, high = low - across, high + across
+    return np.stack([low - across, high + across], axis=1)
+
+
+def _doors_near(segments: np.ndarray, lines: tuple[np.ndarray, ...]) -> list[list[int]]:
+    """Numbers of the segments (D, 2, 2) that A polylines (n, 2) may cross, ascending, of each."""
+    if not len(segments) or not lines:
+        return [[] for _ in lines]
+    boxes = np.array([(line.min(axis=0), line.max(axis=0)) for line in lines])
+    reach = [0.5 * np.hypot(*(box[:, 1] - box[:, 0]).T) for box in (boxes, segments)]
+    found = cKDTree(segments.mean(axis=1)).query_ball_point(
+        boxes.mean(axis=1), reach[0] + reach[1].max() + 1e-6, return_sorted=True
+    )
+    return list(found)
+
+
+def _crossed(segments: np.ndarray, line: np.ndarray) -> list[tuple[int, int]]:
+    """As `doors_crossed`, of segments (D, 2, 2) [m, map frame]."""
+    low, high = segments.swapaxes(0, 1)  # each (D, 2)
     start, step = line[:-1, None], np.diff(line, axis=0)[:, None]  # (n - 1, 1, 2)
     # start + s step = low + t (high - low)
     cross = _cross(step, high - low)

@@ -8,7 +8,6 @@ points of the arcs that are wide enough, with an edge between neighbours (`arc_p
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -77,7 +76,7 @@ def route(
     _check_radius(robot_radius)
     if directed is not None:
         directed = np.asarray(directed)
-        check_array("directed", directed, (len(topological_map.arc_lines),), jnp.bool_)
+        check_array("directed", directed, (len(topological_map.arc_lines),), np.bool_)
     field = None if occupancy is None else clearance_field(occupancy)
     points = arc_points(topological_map, field, directed)
     ends = [("start", route_ends.checked_point("start", start))]

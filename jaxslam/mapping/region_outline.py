@@ -36,24 +36,30 @@ def _boundary(cells: np.ndarray) -> np.ndarray:
         # .         a turn to the left wherever there is a choice
         . #
     """
-    height, width = cells.shape
     moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # each turned left from the one before
-    beside = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]])  # neighbour on the right of each edge
-    starts = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # corner of the cell where it begins
-    edge_at = np.zeros((4, height + 1, width + 1), bool)
-    for turn in range(4):
-        row, column = np.nonzero(cells & ~np.roll(cells, -beside[turn], axis=(0, 1)))
-        edge_at[turn, row + starts[turn, 0], column + starts[turn, 1]] = True
-    turns, rows, columns = np.nonzero(edge_at)
-    number = np.full(edge_at.shape, -1)
-    number[turns, rows, columns] = np.arange(len(turns))
+    beside = ((0, -1), (1, 0), (0, 1), (-1, 0))  # neighbour on the right of each edge
+    starts = ((0, 0), (1, 0), (1, 1), (0, 1))  # corner of the cell where it begins
+    edges = []
+    for turn, ((i, j), (row, column)) in enumerate(zip(beside, starts, strict=True)):
+        neighbour = cells[1 + i : cells.shape[0] - 1 + i, 1 + j : cells.shape[1] - 1 + j]
+        here = np.argwhere(cells[1:-1, 1:-1] & ~neighbour) + [1 + row, 1 + column]
+        edges.append(np.column_stack([np.full(len(here), turn), here]))
+    turns, rows, columns = np.concatenate(edges).T
+    shape = (4, cells.shape[0] + 1, cells.shape[1] + 1)
+    key = np.ravel_multi_index((turns, rows, columns), shape)  # ascending
+
+    def number(turn: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Number of each edge, -1 where there is none."""
+        wanted = np.ravel_multi_index((turn, row, column), shape)
+        found = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        return np.where(key[found] == wanted, found, -1)
+
     ends = np.stack([rows, columns], axis=1) + moves[turns]
     follower = np.full(len(turns), -1)
     for change in (-1, 0, 1):  # right, straight on, left: the last one found is taken
-        nxt = number[(turns + change) % 4, ends[:, 0], ends[:, 1]]
+        nxt = number((turns + change) % 4, *ends.T)
         follower = np.where(nxt >= 0, nxt, follower)
-    first = np.unravel_index(int(cells.argmax()), cells.shape)  # has no neighbour in the row before
-    start = int(number[3, first[0], first[1] + 1])
+    start = int(np.searchsorted(turns, 3))  # of the first cell, which has no neighbour before it
     following = follower.tolist()
     loop, edge = [start], following[start]
     while edge != start:

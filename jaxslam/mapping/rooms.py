@@ -8,7 +8,6 @@ The steps of `find_regions`:
     -> names, those of an earlier division where they fit (`region_names`)
 """
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
@@ -64,8 +63,8 @@ def find_regions(
         modalities using free space layout.
     """
     occupied, free = np.asarray(occupied), np.asarray(free)
-    check_array("occupied", occupied, ("H", "W"), jnp.bool_)
-    check_array("free", free, occupied.shape, jnp.bool_)
+    check_array("occupied", occupied, ("H", "W"), np.bool_)
+    check_array("free", free, occupied.shape, np.bool_)
     origin = as_float64("origin", origin, (3,))
     for name, size in (("resolution", resolution), ("robot_radius", robot_radius)):
         if not 0.0 < size < np.inf:
@@ -110,7 +109,7 @@ def _space(
     size = FURNITURE_SIZE / resolution
     space = medial_axis.free_space(occupied, free, min_obstacle_size=size, min_unknown_size=size)
     space = np.pad(space, 1)
-    distance, nearest = ndimage.distance_transform_edt(space, return_indices=True)
+    distance, nearest = medial_axis.nearest_obstacles(space)
     return space, distance - 0.5, nearest
 
 
@@ -172,15 +171,14 @@ def _with_doors(found: Regions, gaps: Gaps, sides: np.ndarray) -> Regions:
         Door("", jamb.mean(axis=0), jamb, float(width) * found.resolution, (int(a), int(b)))
         for jamb, width, (a, b) in zip(jambs, gaps.width, pairs, strict=True)
     )
+    of_region: list[list[int]] = [[] for _ in found.regions]
+    neighbours: list[set[int]] = [set() for _ in found.regions]
+    for k, (a, b) in enumerate(pairs.tolist()):
+        for here, there in ((a, b), (b, a)):
+            of_region[here].append(k)
+            neighbours[here].add(there)
     regions = tuple(
-        region._replace(
-            doors=tuple(np.flatnonzero((pairs == k).any(axis=1)).tolist()),
-            neighbours=tuple(np.unique(pairs[(pairs == k).any(axis=1)]).tolist()),
-        )
+        region._replace(doors=tuple(of_region[k]), neighbours=tuple(sorted(neighbours[k])))
         for k, region in enumerate(found.regions)
-    )
-    regions = tuple(
-        region._replace(neighbours=tuple(n for n in region.neighbours if n != k))
-        for k, region in enumerate(regions)
     )
     return found._replace(regions=regions, doors=doors)

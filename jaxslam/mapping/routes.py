@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
@@ -81,7 +80,7 @@ def shortest_path(
             negative, NaN or missing.
     """
     for name, node in (("start", start), ("goal", goal)):
-        check_array(name, np.asarray(node), (), jnp.integer)
+        check_array(name, np.asarray(node), (), np.integer)
         if not 0 <= node < num_nodes:
             raise ValueError(f"{name} is {node}, not a node 0 to {num_nodes - 1}")
     lengths = as_float64("lengths", lengths, ("A",))
@@ -123,7 +122,7 @@ def _checked_pairs(pairs: ArrayLike, count: int, num_nodes: int) -> np.ndarray:
     pairs = np.asarray(pairs)
     if pairs.size == 0:
         pairs = np.zeros((0, 2), int)
-    check_array("pairs", pairs, (count, 2), jnp.integer)
+    check_array("pairs", pairs, (count, 2), np.integer)
     if pairs.size and not (0 <= pairs.min() and pairs.max() < num_nodes):
         raise ValueError(f"pairs holds nodes {pairs.min()} to {pairs.max()} of {num_nodes}")
     return pairs

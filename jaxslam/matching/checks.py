@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.arguments import as_array, as_bool, as_float
 from jaxslam.core.scan import Lidar, Scan, check_lidar
-from jaxslam.core.types import Array, as_array, as_bool, as_float, check_array
+from jaxslam.core.types import Array, check_array
 from jaxslam.matching.icp import ScanMatchSpec, Submap
 
 

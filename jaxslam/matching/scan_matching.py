@@ -26,10 +26,11 @@ import numpy as np
 from jax import lax
 
 from jaxslam.core import trace_cache
+from jaxslam.core.arguments import as_bool
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import compose, relative, rotation, wrap_angle
-from jaxslam.core.types import AnyArray, Array, as_bool
+from jaxslam.core.types import AnyArray, Array
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.matching import checks
 from jaxslam.matching.icp import MatchedPose, PosePrior, ScanMatchSpec, Submap, fine_icp, icp

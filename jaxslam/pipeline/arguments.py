@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.arguments import as_bool
 from jaxslam.core.scan import Lidar, Scan
-from jaxslam.core.types import as_bool, as_float64, check_array, check_type
+from jaxslam.core.types import as_float64, check_array, check_type
 from jaxslam.filtering.inputs import check_params
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.lidar import to_scan

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.types import Array, as_float
+from jaxslam.core.arguments import as_float
+from jaxslam.core.types import Array
 from jaxslam.simulation import worlds
 from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW, densify
 from jaxslam.simulation.robot import Robot

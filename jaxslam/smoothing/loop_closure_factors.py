@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import se2_np
-from jaxslam.core.types import as_array, as_float64, check_array
+from jaxslam.core.arguments import as_array
+from jaxslam.core.types import as_float64, check_array
 from jaxslam.matching.loop_closure import LoopClosures
 
 

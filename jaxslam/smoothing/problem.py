@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.arguments import as_array, as_float
 from jaxslam.core.features import restrict_features
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.types import AnyArray, Array, as_array, as_float, check_array
+from jaxslam.core.types import AnyArray, Array, check_array
 from jaxslam.filtering import measurement_model
 from jaxslam.filtering.inputs import as_features, as_scan_match, check_params
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate

@@ -19,7 +19,7 @@ from jaxslam.filtering.config import init
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import lidar
 from jaxslam.pipeline.config import Config
-from jaxslam.viz import canvas, maps
+from jaxslam.viz import canvas, landmarks, maps
 
 NUM_FRAMES = 100
 FRAMES_PER_SECOND = 12
@@ -116,7 +116,7 @@ def animate_run(
         maps.draw_hits(axis, poses, points[:done], hit[:done])
         maps.draw_trajectory(axis, odom_poses[:done], "odometry")
         maps.draw_trajectory(axis, poses, "estimate")
-        maps.draw_landmarks(axis, belief, confirm_count=config.filter.confirm_count)
+        landmarks.draw_landmarks(axis, belief, confirm_count=config.filter.confirm_count)
         maps.draw_robot(axis, poses[-1], returns[done - 1])
         axis.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]", ylabel="y [m]")
         axis.set_title(f"scan {done} of {num_scans}")

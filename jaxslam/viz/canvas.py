@@ -3,11 +3,14 @@
 The palette is that of Okabe and Ito, which is safe for colour-blind readers.
 """
 
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
-from jaxslam.core.types import AnyArray, as_float64
+from jaxslam.core.types import as_float64
 
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -31,7 +34,7 @@ def canvas(
     )
 
 
-def map_canvas(low: AnyArray, high: AnyArray) -> tuple[Figure, Axes]:
+def map_canvas(low: ArrayLike, high: ArrayLike) -> tuple[Figure, Axes]:
     """Figure 900 dots wide, with an axis for the map of a rectangle, in metres at one scale.
 
     Args:
@@ -41,20 +44,21 @@ def map_canvas(low: AnyArray, high: AnyArray) -> tuple[Figure, Axes]:
     Raises:
         ValueError: `low` or `high` is not two finite numbers, or `high` is below `low`.
     """
-    low, high = as_float64("low", low, (2,)), as_float64("high", high, (2,))
-    if not (np.isfinite([low, high]).all() and (low <= high).all()):
-        raise ValueError(f"low is {low.tolist()} and high {high.tolist()}, which is no rectangle")
-    margin = 0.03 * np.max(high - low) + 0.2
-    low, high = low - margin, high + margin
-    width, height = high - low
+    lowest, highest = as_float64("low", low, (2,)), as_float64("high", high, (2,))
+    if not (np.isfinite([lowest, highest]).all() and (lowest <= highest).all()):
+        wanted = "which is no rectangle"
+        raise ValueError(f"low is {lowest.tolist()} and high {highest.tolist()}, {wanted}")
+    margin = 0.03 * np.max(highest - lowest) + 0.2
+    lowest, highest = lowest - margin, highest + margin
+    width, height = highest - lowest
     figure, axes = canvas(9.0, float(np.clip(8.2 * height / width, 2.5, 9.0)) + 1.1)
     axis = axes[0, 0]
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axis.set(xlim=(lowest[0], highest[0]), ylim=(lowest[1], highest[1]), aspect="equal")
     axis.set(xlabel="x [m]", ylabel="y [m]")
     return figure, axis
 
 
-def extent(*groups: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+def extent(*groups: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Bounding box of points or poses; those that are not finite are left out.
 
     Args:
@@ -80,3 +84,12 @@ def extent(*groups: AnyArray) -> tuple[np.ndarray, np.ndarray]:
 def legend(figure: Figure) -> None:
     """Add one legend below all axes of a figure."""
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure to a file; its layout is made first, so that it is drawn only once."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+    figure.set_layout_engine(None)
+    figure.savefig(path)

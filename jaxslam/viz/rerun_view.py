@@ -111,7 +111,7 @@ class RerunView:
         from rerun import LineStrips3D, Points3D
 
         from jaxslam.viz.canvas import NUM_SIGMAS
-        from jaxslam.viz.maps import LANDMARK_STYLES
+        from jaxslam.viz.landmarks import LANDMARK_STYLES
 
         confirmed = np.asarray(config_module.confirmed(self._config.filter, belief))
         position = np.asarray(belief.landmark_positions, np.float64)

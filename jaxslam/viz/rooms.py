@@ -4,18 +4,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.transforms import Affine2D
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jaxslam.core.regions import Regions
 from jaxslam.core.se2_np import transform
-from jaxslam.core.types import AnyArray
 from jaxslam.viz.canvas import BLACK, GREY, PINK
 
 SHADE = 0.55  # opacity of the colours of rooms
 MAX_NAMES = 150  # rooms whose numbers are drawn
 
 
-def draw_rooms(axis: Axes, regions: Regions, colours: AnyArray) -> None:
+def draw_rooms(axis: Axes, regions: Regions, colours: ArrayLike) -> None:
     """Draw each region in its colour, with the number of its name, and a line across each door.
 
     Args:
@@ -65,5 +65,6 @@ def _draw_numbers(axis: Axes, regions: Regions) -> None:
         middle = cells[np.abs(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
         x, y = transform(regions.origin, (middle + 0.5) * regions.resolution).tolist()
         number = regions.regions[k].name.partition("_")[2]
-        style = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.7, "linewidth": 0.0}
-        axis.text(x, y, number, ha="center", va="center", fontsize=5, color=BLACK, bbox=style)
+        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.7, "linewidth": 0.0}
+        text = axis.text(x, y, number, fontsize=5, color=BLACK, bbox=box, in_layout=False)
+        text.set(ha="center", va="center")

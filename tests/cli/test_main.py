@@ -16,7 +16,7 @@ from PIL import Image
 
 import jaxslam
 from jaxslam.cli import main, run_command, simulate_command, tune_command
-from jaxslam.cli.options import _covered
+from jaxslam.cli.stopwatch import _covered
 from jaxslam.core import se2
 from jaxslam.core.se2 import transform
 from jaxslam.core.se2_np import relative
@@ -184,6 +184,7 @@ def test_run_writes_its_files_and_nothing_else(done):
     names = {"metrics.json", "trajectory.tum", "map.geojson", "map.graphml", "map.yaml", "map.pgm"}
     names |= {
         "map.lif.json",
+        "map.nav2.geojson",
         "map.rmf.yaml",
         "map.png",
         "rooms.json",

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxslam.cli import main, report
+from jaxslam.cli import main, map_files
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.io import graphml, rooms_file, ros_map
 from jaxslam.viz import canvas, maps
 
 FILES = {"metrics.json", "map.geojson", "map.graphml", "map.lif.json", "map.rmf.yaml", "map.png"}
-FILES |= {"map.yaml", "map.pgm", "rooms.json", "rooms.png"}
+FILES |= {"map.nav2.geojson", "map.yaml", "map.pgm", "rooms.json", "rooms.png"}
 YAML = "image: a.pgm\nresolution: 0.1\norigin: [-2.0, 1.0, 0.0]\nnegate: 0\n"
 YAML += "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
 MAPS = Path(__file__).resolve().parents[3] / "shared" / "data" / "maps"
@@ -163,7 +163,7 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "draw_map", stop)
+    monkeypatch.setattr(map_files, "draw_map", stop)
     assert main.main(["map", str(write_map(tmp_path)), "--out", str(tmp_path / "out")]) == 130
     assert {file.name for file in tmp_path.iterdir()} == {"a.pgm", "a.yaml"}
 

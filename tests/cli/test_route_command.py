@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxslam.cli import main, report, route_command
+from jaxslam.cli import main, route_command
 from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.regions import Door, Region, Regions
 from jaxslam.io import ros_map
@@ -181,6 +181,6 @@ def test_an_interrupt_leaves_nothing_behind(floor, tmp_path, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "draw_route", stop)
+    monkeypatch.setattr(route_command, "draw_route", stop)
     assert run(floor, "--from", -3, -1, "--to", 3, 1, "--out", tmp_path / "out") == 130
     assert not list(tmp_path.iterdir())

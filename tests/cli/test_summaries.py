@@ -48,5 +48,5 @@ def test_the_exit_code_is_that_of_the_command(returned, code, monkeypatch):
         """Run."""
         return returned
 
-    monkeypatch.setitem(main.COMMANDS, "run", run)
+    monkeypatch.setattr(main, "function_of", {"run": run}.get)
     assert main.main(["run"]) == code

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core.types import as_bool, as_float, as_float64, check_array, check_covariance
+from jaxslam.core.arguments import as_bool, as_float, check_covariance
+from jaxslam.core.types import as_float64, check_array
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from small_building import building
 
 from experiments import export_readers
-from jaxslam.cli import report
+from jaxslam.cli import map_files, report
 from jaxslam.core.se2_np import dead_reckoning
 from jaxslam.io import g2o_writer
 from jaxslam.mapping.pose_graph import PoseGraph
@@ -33,7 +33,7 @@ def folder(tmp_path):
     )
     g2o_writer.write(tmp_path / "graph.g2o", graph)
     report.write_map(tmp_path / "map.geojson", building()._replace(frontier_id=np.zeros(0, int)))
-    report.write_exports(tmp_path, building())
+    map_files.write_exports(tmp_path, building())
     return tmp_path
 
 

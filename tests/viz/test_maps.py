@@ -9,7 +9,7 @@ from jaxslam.filtering.belief import initial_belief
 from jaxslam.frontend.automaton import Diagram
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation.worlds import World, named
-from jaxslam.viz import canvas, maps
+from jaxslam.viz import canvas, landmarks, maps
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_poses_are_coloured_by_their_probability_the_likely_ones_on_top(axis):
 
 
 def test_confirmed_landmarks_are_drawn_with_three_sigma_ellipses(axis):
-    maps.draw_landmarks(axis, belief(), confirm_count=2)
+    landmarks.draw_landmarks(axis, belief(), confirm_count=2)
     positions = [line.get_xydata().tolist() for line in axis.lines]
     assert positions == [[[1.0, 2.0]], [[3.0, 4.0]]]
     junction, corner = of_type(axis, EllipseCollection)
@@ -76,7 +76,7 @@ def test_an_ellipse_is_turned_as_its_covariance(axis, angle):
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     cov = turn @ np.diag([0.25, 0.01]) @ turn.T
-    maps.draw_ellipses(axis, np.zeros((1, 2)), cov[None], canvas.BLACK)
+    landmarks.draw_ellipses(axis, np.zeros((1, 2)), cov[None], canvas.BLACK)
     (drawn,) = of_type(axis, EllipseCollection)
     assert np.tan(np.radians(drawn.get_angles()[0])) == pytest.approx(np.tan(angle))
     assert drawn.get_widths()[0] == pytest.approx(2 * 3 * 0.5)
@@ -110,7 +110,7 @@ def test_an_empty_map_draws_nothing(axis):
         arc_lines=(),
     )
     maps.draw_arcs(axis, none)
-    maps.draw_landmarks(axis, initial_belief(jnp.zeros(3), max_landmarks=4), confirm_count=2)
+    landmarks.draw_landmarks(axis, initial_belief(jnp.zeros(3), max_landmarks=4), confirm_count=2)
     axis.figure.draw_without_rendering()
 
 
@@ -128,7 +128,7 @@ def test_the_local_diagram_is_drawn_as_the_robot_sees_it(axis, tmp_path):
     labels[:, : size[1] // 2], labels[:, size[1] // 2 :] = 1, 2  # right of the robot, left of it
     diagram = Diagram(labels=jnp.asarray(labels), arrival=jnp.zeros(size, jnp.int32))
     sources = np.zeros(size, bool)
-    maps.draw_local_diagram(axis, diagram, sources, config.frontend.grid)
+    landmarks.draw_local_diagram(axis, diagram, sources, config.frontend.grid)
     image = axis.images[0].get_array()
     middle = size[1] // 2
     dark = np.flatnonzero((image[size[0] // 2] == 0.0).all(axis=-1))
@@ -145,7 +145,7 @@ def test_a_whole_picture_is_written(tmp_path):
     for what in maps.TRAJECTORY_STYLES:
         maps.draw_trajectory(axis, poses, what)
     maps.draw_start_and_end(axis, poses)
-    maps.draw_landmarks(axis, belief(), confirm_count=2)
+    landmarks.draw_landmarks(axis, belief(), confirm_count=2)
     canvas.legend(figure)
     figure.savefig(tmp_path / "path.png")
     assert (tmp_path / "path.png").stat().st_size > 10_000
@@ -178,8 +178,8 @@ GRID = OccupancyMap(np.zeros((3, 2), bool), np.zeros((3, 2), bool), 0.5, np.zero
         (maps.draw_robot, (POSES, POINTS[0]), r"pose is .* \(2, 3\), not \(3,\)"),
         (maps.draw_robot, (POSES[0], POINTS), "ends is"),
         (maps.draw_start_and_end, (POSES[:0],), "poses is empty"),
-        (maps.draw_ellipses, (POSES, np.eye(2), "red"), "xy is"),
-        (maps.draw_ellipses, (POSES[:, :2], np.eye(2), "red"), "cov is"),
+        (landmarks.draw_ellipses, (POSES, np.eye(2), "red"), "xy is"),
+        (landmarks.draw_ellipses, (POSES[:, :2], np.eye(2), "red"), "cov is"),
         (maps.draw_walls, (World(np.zeros((3, 2))),), r"world.walls is .* \(3, 2\), not \(N, 4\)"),
         (maps.draw_occupancy, (GRID._replace(free=HIT),), "grid.free is"),
         (maps.draw_occupancy, (GRID._replace(origin=[0.0, 1.0]),), "grid.origin is"),
@@ -198,4 +198,4 @@ def test_a_grid_without_known_cells_has_no_corners():
 def test_a_diagram_of_another_grid_is_refused(axis):
     diagram = Diagram(labels=jnp.zeros((3, 3), jnp.uint32), arrival=jnp.zeros((3, 3), jnp.int32))
     with pytest.raises(ValueError, match="diagram.labels is uint32"):
-        maps.draw_local_diagram(axis, diagram, np.zeros((3, 3), bool), Config().frontend.grid)
+        landmarks.draw_local_diagram(axis, diagram, np.zeros((3, 3), bool), Config().frontend.grid)

@@ -36,8 +36,9 @@ def map_occupancy(
     """Extract the topological map, the rooms and the doors of an occupancy grid.
 
     Writes metrics.json, map.geojson, map.graphml, map.nav2.geojson, map.lif.json and map.rmf.yaml,
-    for robots and fleets, map.png, rooms.json and rooms.png, and the grid itself as map.yaml and map.pgm; needs the extras
-    [ros] and [graph]. Rooms and doors keep their names of an earlier call with the same folder.
+    for robots and fleets, map.png, rooms.json and rooms.png, and the grid itself as map.yaml and
+    map.pgm; needs the extras [ros] and [graph]. Rooms and doors keep their names of an earlier call
+    with the same folder.
 
     Args:
         map_file: YAML file of map_server, with its image in the same folder; or a picture alone,

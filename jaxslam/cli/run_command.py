@@ -83,12 +83,13 @@ def run(
     Every scan is matched; filter and maps are given keyframes, 0.3 m or 0.3 rad apart. Writes
     metrics.json, trajectory.tum, path.png and errors.png; the topological map as map.geojson, with
     the extra [graph] as map.graphml, and in straight lanes, for robots and fleets, as
-    map.nav2.geojson, map.lif.json and map.rmf.yaml; its rooms and doors as rooms.json and rooms.png; all drawn in map.png; an occupancy grid as map.yaml and
-    map.pgm, for map_server and `jaxslam map`; the pose graph graph.g2o, for batch optimisers; and
-    map.npz, all that later sessions need of the map, for `jaxslam.load_map`. The pose of the first
-    scan is the origin of the map. Where the map contradicts itself, loops are
-    closed at places that are found again, however far off, and a note names them. A WARNING names
-    the scans where it still does, because the run was lost there; path.png marks them.
+    map.nav2.geojson, map.lif.json and map.rmf.yaml; its rooms and doors as rooms.json and
+    rooms.png; all drawn in map.png; an occupancy grid as map.yaml and map.pgm, for map_server and
+    `jaxslam map`; the pose graph graph.g2o, for batch optimisers; and map.npz, all that later
+    sessions need of the map, for `jaxslam.load_map`. The pose of the first scan is the origin of
+    the map. Where the map contradicts itself, loops are closed at places that are found again,
+    however far off, and a note names them. A WARNING names the scans where it still does, because
+    the run was lost there; path.png marks them.
 
     Args:
         log: CARMEN or Player log, ROS bag, g2o pose graph with scans, or NumPy file; `killian` is

@@ -62,8 +62,8 @@ def trace_cells(
     number = np.full(np.add(cells.shape, 2), -1)  # of each cell, -1 for none; padded
     number[tuple(index.T + 1)] = np.arange(len(index))
     height = clearance[tuple(index.T)]
-    neighbours = _neighbours(number)
-    node_of = _node_cells(number, neighbours, height)
+    neighbours = _neighbours(number, index)
+    node_of = _node_cells(number, index, neighbours, height)
     if also is not None:
         for cell in np.flatnonzero(also[tuple(index.T)]).tolist():
             node_of.setdefault(cell, cell)
@@ -96,13 +96,12 @@ def trace_cells(
     return cell_graph
 
 
-def _shifted(number: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Number (H, W) of the cell `row` rows and `column` columns on, from the padded numbers."""
-    height, width = number.shape
-    return number[1 + row : height - 1 + row, 1 + column : width - 1 + column]
+def _beside(number: np.ndarray, index: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Number (C,) of the cell `row` rows and `column` columns on from cells (C, 2)."""
+    return number[index[:, 0] + 1 + row, index[:, 1] + 1 + column]
 
 
-def _neighbours(number: np.ndarray) -> dict[int, list[int]]:
+def _neighbours(number: np.ndarray, index: np.ndarray) -> dict[int, list[int]]:
     """Neighbours of each cell: those at a side, and across a corner where no cell is at both sides.
 
         a #        a and b are neighbours through #, not across the corner
@@ -110,27 +109,27 @@ def _neighbours(number: np.ndarray) -> dict[int, list[int]]:
 
     Args:
         number: (H + 2, W + 2) number of each cell, -1 for none.
+        index: (C, 2) the cells by their numbers.
     """
-    here, below, right = _shifted(number, 0, 0), _shifted(number, 1, 0), _shifted(number, 0, 1)
-    left = _shifted(number, 0, -1)
-    everywhere = np.ones(here.shape, bool)
+    below, right, left = (_beside(number, index, *to) for to in ((1, 0), (0, 1), (0, -1)))
+    everywhere = np.ones(len(index), bool)
     pairs = (
         (below, everywhere),
         (right, everywhere),
-        (_shifted(number, 1, 1), (below < 0) & (right < 0)),
-        (_shifted(number, 1, -1), (below < 0) & (left < 0)),
+        (_beside(number, index, 1, 1), (below < 0) & (right < 0)),
+        (_beside(number, index, 1, -1), (below < 0) & (left < 0)),
     )
     neighbours: dict[int, list[int]] = defaultdict(list)
     for other, joined in pairs:
-        joined = joined & (here >= 0) & (other >= 0)
-        for a, b in zip(here[joined].tolist(), other[joined].tolist(), strict=True):
+        here = np.flatnonzero(joined & (other >= 0))
+        for a, b in zip(here.tolist(), other[here].tolist(), strict=True):
             neighbours[a].append(b)
             neighbours[b].append(a)
     return neighbours
 
 
 def _node_cells(
-    number: np.ndarray, neighbours: dict[int, list[int]], height: np.ndarray
+    number: np.ndarray, index: np.ndarray, neighbours: dict[int, list[int]], height: np.ndarray
 ) -> dict[int, int]:
     """Cells that belong to nodes, each with the cell that stands for its node.
 
@@ -140,14 +139,16 @@ def _node_cells(
 
     Args:
         number: (H + 2, W + 2) number of each cell, -1 for none.
+        index: (C, 2) the cells by their numbers.
         neighbours: Numbers of the neighbours of each cell.
         height: (C,) clearance of each cell.
     """
     node_of = {cell: cell for cell in range(len(height)) if len(neighbours[cell]) != 2}
-    corners = [_shifted(number, row, column) for row, column in ((0, 0), (1, 0), (0, 1), (1, 1))]
-    is_square = np.logical_and.reduce([corner >= 0 for corner in corners])
+    block = np.stack(
+        [_beside(number, index, *to) for to in ((0, 0), (1, 0), (0, 1), (1, 1))], axis=-1
+    )
     members = {cell: [cell] for cell in node_of}  # of each node
-    for square in np.stack([corner[is_square] for corner in corners], axis=-1).tolist():
+    for square in block[(block >= 0).all(axis=-1)].tolist():
         united = {node_of.get(cell, cell) for cell in square}
         best = max(united, key=lambda cell: (height[cell], -cell))
         cells = dict.fromkeys(square) | {c: None for node in united for c in members.pop(node, ())}

@@ -24,6 +24,9 @@ MIN_RUN = 4
 """[cells] Nearer to walls than that, fewer anchors beside each other are no dead end."""
 
 
+_ROWS = 64  # of the grid, whose distances are computed at once
+
+
 class FreeConfigurations(NamedTuple):
     """Free configurations of a disc-shaped robot, H x W cells.
 
@@ -74,9 +77,12 @@ def nearest_obstacles(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (H, W) float64 between the centres of the cells, and (2, H, W) int32.
     """
     nearest = ndimage.distance_transform_edt(free, return_distances=False, return_indices=True)
-    distance = np.square(nearest[0] - np.arange(free.shape[0], dtype=float)[:, None])
-    distance += np.square(nearest[1] - np.arange(free.shape[1], dtype=float))
-    return np.sqrt(distance, out=distance), nearest
+    distance, column = np.empty(free.shape), np.arange(free.shape[1], dtype=float)
+    for top in range(0, len(free), _ROWS):
+        rows = np.arange(top, min(top + _ROWS, len(free)), dtype=float)[:, None]
+        i, j = nearest[:, top : top + _ROWS]
+        distance[top : top + _ROWS] = np.sqrt((i - rows) ** 2 + (j - column) ** 2)
+    return distance, nearest
 
 
 def free_configurations(
@@ -135,20 +141,20 @@ def between_walls(space: FreeConfigurations, wall: np.ndarray, *, angle: float) 
     """
     inside = space.region > 0
     anchors = np.zeros(inside.shape, bool)
-    last_index = np.array(inside.shape)[:, None, None] - 1
-    is_wall = wall[tuple(np.clip(space.nearest_obstacle, 0, last_index))]
-    distance = space.distance + 0.5
+    last_index = np.array(inside.shape)[:, None] - 1
+    factor = 2 * np.sin(0.5 * angle)
+    (row, column), distance = space.nearest_obstacle, space.distance
     for low, high in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
-        row, column = space.nearest_obstacle
-        step = row[low] - row[high], column[low] - column[high]
-        between = inside[low] & inside[high] & (is_wall[low] | is_wall[high])
-        between &= (step[0] != 0) | (step[1] != 0)
-        larger = np.maximum(distance[low][between], distance[high][between])
-        apart = np.hypot(step[0][between], step[1][between])
-        between[between] = apart >= 2 * np.sin(0.5 * angle) * larger
-        high_is_farther = distance[high] > distance[low]
-        anchors[low] |= between & ~high_is_farther
-        anchors[high] |= between & high_is_farther
+        # The larger distance is at least one cell, so nearer obstacles are not far enough apart.
+        apart = np.maximum(np.abs(row[low] - row[high]), np.abs(column[low] - column[high]))
+        pair = np.nonzero(inside[low] & inside[high] & (apart >= factor / np.sqrt(2)))
+        feet = [np.stack([row[side][pair], column[side][pair]]) for side in (low, high)]
+        far_low, far_high = distance[low][pair] + 0.5, distance[high][pair] + 0.5
+        between = np.hypot(*(feet[0] - feet[1])) >= factor * np.maximum(far_low, far_high)
+        is_wall = [wall[tuple(np.clip(foot, 0, last_index))] for foot in feet]
+        between &= is_wall[0] | is_wall[1]
+        for side, chosen in ((low, far_high <= far_low), (high, far_high > far_low)):
+            anchors[side][pair[0][between & chosen], pair[1][between & chosen]] = True
     return anchors & ~_few(anchors, space.distance)
 
 
@@ -160,11 +166,13 @@ def _few(anchors: np.ndarray, distance: np.ndarray) -> np.ndarray:
         distance: (H, W) [cells] to the nearest obstacle.
     """
     group, _ = ndimage.label(ndimage.binary_dilation(anchors, _EIGHT), structure=_EIGHT)
-    group = np.where(anchors, group, 0)
-    count = np.bincount(group.ravel())
+    of_anchor = group[anchors]
+    count = np.bincount(of_anchor)
     farthest = np.zeros(len(count))
-    np.maximum.at(farthest, group[anchors], distance[anchors])
-    return anchors & ((count < MIN_RUN) & (farthest < COARSE_DISTANCE))[group]
+    np.maximum.at(farthest, of_anchor, distance[anchors])
+    few = np.zeros(anchors.shape, bool)
+    few[anchors] = ((count < MIN_RUN) & (farthest < COARSE_DISTANCE))[of_anchor]
+    return few
 
 
 def medial_cells(space: FreeConfigurations, regions: np.ndarray, kept: np.ndarray) -> np.ndarray:
@@ -181,7 +189,7 @@ def medial_cells(space: FreeConfigurations, regions: np.ndarray, kept: np.ndarra
     Returns:
         (H, W) bool.
     """
-    level = (4.0 * space.distance).astype(np.int64)
+    level = (4.0 * space.distance).astype(np.int32)
     rough = _thin(regions, level, kept, ends=False)
     return _thin(rough, level, np.zeros_like(kept), ends=True)
 
@@ -246,7 +254,6 @@ def _thin(cells: np.ndarray, level: np.ndarray, kept: np.ndarray, *, ends: bool)
     is_set = np.pad(cells, 1).ravel()
     removable = is_set & ~np.pad(kept, 1).ravel()
     level = np.where(removable, np.pad(level, 1).ravel(), np.iinfo(level.dtype).max)
-    parity = np.add.outer(2 * (np.arange(cells.shape[0] + 2) % 2), np.arange(width) % 2).ravel()
     offsets = np.array([row * width + column for row, column in _ROUND])
     bits = 1 << np.arange(8)
     order = np.flatnonzero(removable)
@@ -255,8 +262,9 @@ def _thin(cells: np.ndarray, level: np.ndarray, kept: np.ndarray, *, ends: bool)
     for current, pending in zip(levels, np.split(order, first[1:]), strict=True):
         while pending.size:
             removed = []
+            parity = 2 * (pending // width % 2) + pending % width % 2
             for parity_class in range(4):
-                tried = pending[parity[pending] == parity_class]
+                tried = pending[parity == parity_class]
                 pattern = is_set[tried[:, None] + offsets] @ bits
                 remove = _SIMPLE[pattern] & ~(ends & (_COUNT[pattern] == 1))
                 is_set[tried[remove]] = False

@@ -105,7 +105,7 @@ def doors_crossed(doors: tuple[Door, ...], line: np.ndarray) -> list[tuple[int, 
 
 
 def _segments(doors: tuple[Door, ...]) -> np.ndarray:
-    """Ends (D, 2, 2) [m, map frame] of the lines across doors, longer by `DOOR_MARGIN` each."""
+    """Ends (D, 2, 2) [m, map frame] of lines across doors, `DOOR_MARGIN` beyond their jambs."""
     low, high = np.array([door.jambs for door in doors], float).reshape(-1, 2, 2).swapaxes(0, 1)
     width = np.hypot(*(high - low).T)[:, None]
     across = DOOR_MARGIN * (high - low) / np.maximum(width, 1e-9)

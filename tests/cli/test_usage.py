@@ -96,3 +96,12 @@ def test_importing_the_command_line_does_not_import_matplotlib():
     code = "import sys, jaxslam.cli.main; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize("command", ["map_command", "route_command"])
+def test_commands_on_saved_maps_do_not_import_jax(command):
+    """Nor do the pictures that they draw."""
+    code = f"import sys, jaxslam.cli.main, jaxslam.cli.{command}\n"
+    code += "from jaxslam.viz import canvas, maps, rooms, routes\nprint('jax' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

@@ -1,6 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from jaxslam.viz import canvas
 
@@ -31,3 +32,12 @@ def test_a_bad_argument_is_named():
     for high in ([-1.0, 1.0], [np.nan, 1.0]):
         with pytest.raises(ValueError, match="which is no rectangle"):
             canvas.map_canvas([0.0, 0.0], high)
+
+
+def test_a_saved_figure_is_as_matplotlib_lays_it_out(tmp_path):
+    for name, save in (("own.png", canvas.save), ("plain.png", Figure.savefig)):
+        figure, axis = canvas.map_canvas([0.0, 0.0], [3.0, 2.0])
+        axis.plot([0.0, 3.0], [0.0, 2.0], label="line")
+        canvas.legend(figure)
+        save(figure, tmp_path / name)
+    assert (tmp_path / "own.png").read_bytes() == (tmp_path / "plain.png").read_bytes()

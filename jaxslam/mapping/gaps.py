@@ -54,10 +54,11 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
 
     With d the larger of the distances of two neighbouring cells to their feet f1 and f2, these
     appear under an angle of at least `FACING_ANGLE` if |f1 - f2| >= 2 d sin(angle / 2); at a local
-    minimum of the clearance along the medial axis it is 180 degrees.
+    minimum of the clearance along the medial axis it is 180 degrees. In a passage one cell wide the
+    medial axis goes through the cells, not between two: the obstacles on both sides are the feet.
 
     Args:
-        free: (H, W) bool.
+        free: (H, W) bool; cells at the border of the grid are not free.
         distance: (H, W) [cells] to the edge of the nearest obstacle.
         nearest: (2, H, W) int index of that obstacle.
 
@@ -78,6 +79,10 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
             larger = np.maximum(far[low].ravel()[pair], far[high].ravel()[pair]) + 0.5
             facing = np.hypot(*(first - second)) >= factor * larger
             found.append(np.stack([first[:, facing].T, second[:, facing].T], axis=1))
+    for side in np.eye(2, dtype=np.int64):
+        before, after = (np.roll(free, step, axis=(0, 1)) for step in (side, -side))
+        narrow = np.argwhere(free & ~before & ~after)
+        found.append(np.stack([narrow - side, narrow + side], axis=1))
     return gaps_between(np.unique(np.concatenate(found), axis=0))
 
 

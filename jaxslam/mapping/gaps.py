@@ -83,7 +83,24 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
         before, after = (np.roll(free, step, axis=(0, 1)) for step in (side, -side))
         narrow = np.argwhere(free & ~before & ~after)
         found.append(np.stack([narrow - side, narrow + side], axis=1))
-    return gaps_between(np.unique(np.concatenate(found), axis=0))
+    feet = np.unique(np.concatenate(found), axis=0)
+    return gaps_between(feet[~_at_a_step(free, feet)])
+
+
+def _at_a_step(free: np.ndarray, feet: np.ndarray) -> np.ndarray:
+    """Which pairs of feet (K, 2, 2) have an obstacle that touches both, as at a step of a wall.
+
+        # f1
+          #  f2      no passage, though a free cell below the step is near to both
+    """
+    middle = feet.sum(axis=1) // 2
+    touched = np.zeros(len(feet), bool)
+    last = np.array(free.shape)[:, None] - 1
+    for step in np.argwhere(np.ones((3, 3), bool)) - 1:
+        cell = middle + step
+        beside = np.abs(feet - cell[:, None]).max(axis=(1, 2)) == 1
+        touched |= beside & ~free[tuple(np.clip(cell.T, 0, last))]
+    return touched
 
 
 class Passages:

@@ -44,7 +44,7 @@ def find_regions(
     A region is free space in which the robot fits, at least `MIN_AREA` large (`MIN_CLOSED_AREA`
     without a door), whether or not the robot fits through its doors. Small free-standing obstacles
     belong to the region around them, but not to its area. Free space along most of the border of
-    the grid is outside, no region.
+    the grid, on all four sides, is outside, no region, unless there is no other region.
 
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
@@ -86,7 +86,7 @@ def find_regions(
     )
     kept = _has_door(cells, sides, MIN_CLOSED_AREA / resolution**2)
     label[box] = cells[1:-1, 1:-1]
-    kept &= ~_is_outside(label, len(kept))
+    kept &= ~_is_outside(label, kept)
     number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
     label, cells, sides = number[label], number[cells], number[sides]
     corner = np.array([side.start for side in box])
@@ -132,12 +132,13 @@ def _has_door(label: np.ndarray, sides: np.ndarray, min_area: float) -> np.ndarr
     return kept
 
 
-def _is_outside(label: np.ndarray, count: int) -> np.ndarray:
-    """Which labels (count,) lie along most of the border of the grid; not 0."""
-    border = np.concatenate([label[0], label[-1], label[1:-1, 0], label[1:-1, -1]])
-    outside = np.bincount(border, minlength=count) > OUTSIDE_SHARE * len(border)
-    outside[0] = False
-    return outside
+def _is_outside(label: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Which of the `kept` labels (L + 1,) lie around all others: along most of the border."""
+    sides = label[0], label[-1], label[1:-1, 0], label[1:-1, -1]
+    counts = np.stack([np.bincount(side, minlength=len(kept)) for side in sides])
+    total = sum(len(side) for side in sides)
+    outside = kept & (counts.sum(axis=0) > OUTSIDE_SHARE * total) & (counts > 0).all(axis=0)
+    return outside & (kept.sum() > 1)
 
 
 def _to_map(points: np.ndarray, resolution: float, origin: np.ndarray) -> np.ndarray:

@@ -155,10 +155,11 @@ def _regions(
 ) -> tuple[Region, ...]:
     """Regions of the labels, without names and doors; `area` [m^2] and `radius` [m] of each."""
     found = []
-    for k, polygon in enumerate(outlines(label, len(area))):
+    for k, loops in enumerate(outlines(label, len(area))):
         long = area[k] >= CORRIDOR_LENGTH * (2.0 * radius[k]) ** 2
         kind = "corridor" if long else "hall" if area[k] >= HALL_AREA else "room"
-        found.append(Region("", kind, _to_map(polygon, resolution, origin), float(area[k]), (), ()))
+        polygon, *holes = (_to_map(loop, resolution, origin) for loop in loops)
+        found.append(Region("", kind, polygon, float(area[k]), (), (), tuple(holes)))
     return tuple(found)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxslam.core.pairing import one_to_one
 from jaxslam.core.regions import Door, Regions, contains, outer_first
 from jaxslam.core.se2_np import inverse_transform, transform
 
@@ -69,8 +70,7 @@ def _same_regions(found: Regions, old: Regions) -> dict[int, int]:
     sizes = counts.sum(axis=1)[1:], counts.sum(axis=0)[1:]
     shared = counts[1:, 1:]
     enough = (shared > 0) & (shared >= MIN_OVERLAP * np.minimum.outer(*sizes))
-    pairs = np.argwhere(enough)
-    return _one_to_one(pairs[np.lexsort((*pairs.T[::-1], -shared[enough]))])
+    return one_to_one(np.argwhere(enough), -shared[enough])
 
 
 def _same_doors(found: Sequence[Door], old: Sequence[Door]) -> dict[int, int]:
@@ -78,19 +78,8 @@ def _same_doors(found: Sequence[Door], old: Sequence[Door]) -> dict[int, int]:
     here = np.array([door.xy for door in found], float).reshape(-1, 1, 2)
     there = np.array([door.xy for door in old], float).reshape(1, -1, 2)
     distance = np.linalg.norm(here - there, axis=2)
-    pairs = np.argwhere(distance <= DOOR_DISTANCE)
-    return _one_to_one(pairs[np.lexsort((*pairs.T[::-1], distance[tuple(pairs.T)]))])
-
-
-def _one_to_one(pairs: np.ndarray) -> dict[int, int]:
-    """The first pair (n, 2) of each index, on both sides."""
-    same: dict[int, int] = {}
-    taken: set[int] = set()
-    for k, other in pairs.tolist():
-        if k not in same and other not in taken:
-            same[k] = other
-            taken.add(other)
-    return same
+    near = distance <= DOOR_DISTANCE
+    return one_to_one(np.argwhere(near), distance[near])
 
 
 def _rasterised(old: Regions, grid: Regions) -> np.ndarray:

@@ -129,7 +129,7 @@ def innermost(region: Region) -> tuple[np.ndarray, float]:
     """The point of a region that is farthest from its border, the middle one of several.
 
     Returns:
-        The point (2,) [m, map frame], and its distance [m] to the border at least.
+        The point (2,) [m, map frame], and its distance [m] to the border or a little less.
     """
     low, high = region.polygon.min(axis=0), region.polygon.max(axis=0)
     size = np.maximum(high - low, 1e-9)
@@ -144,4 +144,4 @@ def innermost(region: Region) -> tuple[np.ndarray, float]:
     middle = points[inside].mean(axis=0)
     candidates = np.flatnonzero(distance > distance.max() - 1.0)
     best = candidates[np.hypot(*(points[candidates] - middle).T).argmin()]
-    return points[best], max(float(distance[best]) - 1.0, 0.0) * step
+    return points[best], max(float(distance[best]) - 1.5, 0.0) * step

@@ -355,6 +355,15 @@ def test_a_small_hole_in_a_wall_joins_no_rooms_and_hides_no_door(seed):
     assert any(door.width == pytest.approx(0.9, abs=0.2) for door in found.doors)
 
 
+@pytest.mark.parametrize("cell", [0.05, 0.2])
+def test_steps_of_walls_that_are_turned_divide_no_corridor(cell):
+    x, y = (np.indices((round(20 / cell),) * 2) + 0.5) * cell - 10.0
+    for angle in np.linspace(0.0, 1.5, 9):
+        c, s = np.cos(angle), np.sin(angle)
+        free = (np.abs(x * c + y * s) < 8.0) & (np.abs(y * c - x * s) < 0.75)
+        assert [region.kind for region in divided(free, resolution=cell).regions] == ["corridor"]
+
+
 @pytest.mark.parametrize("cell", [0.1, 1.0])
 def test_a_door_of_one_cell_is_a_door(cell):
     free = np.zeros((60, 30), bool)

@@ -90,8 +90,8 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
 def _at_a_step(free: np.ndarray, feet: np.ndarray) -> np.ndarray:
     """Which pairs of feet (K, 2, 2) have an obstacle that touches both, as at a step of a wall.
 
-        # f1
-          #  f2      no passage, though a free cell below the step is near to both
+    # f1
+      #  f2      no passage, though a free cell below the step is near to both
     """
     middle = feet.sum(axis=1) // 2
     touched = np.zeros(len(feet), bool)

@@ -12,7 +12,6 @@ from jaxslam.viz.canvas import BLACK, GREY, PINK
 SHADE = 0.55  # opacity of the colours of rooms
 FONT_SIZE = 5.0  # [points] of the numbers of rooms
 _DIGIT = 0.65  # width of a digit, relative to the font size
-_USED = 0.85  # of the figure, that the axes fill
 
 
 def draw_rooms(axis: Axes, regions: Regions) -> None:
@@ -64,17 +63,17 @@ def _path(region: Region) -> Path:
 
 def _draw_numbers(axis: Axes, regions: Regions) -> None:
     """Write the number of each region that it fits in, over arcs and nodes, below all marks."""
-    figure = axis.get_figure(root=True)
     (x, x_end), (y, y_end) = axis.get_xlim(), axis.get_ylim()
-    width, height = figure.get_size_inches()
-    point = max((x_end - x) / width, (y_end - y) / height) / _USED / 72.0  # [m] of a point
+    frame = axis.get_window_extent()  # [dots], before the layout, which makes it larger
+    dot = max((x_end - x) / frame.width, (y_end - y) / frame.height)  # [m]
+    height = FONT_SIZE * axis.figure.dpi / 72.0 * dot  # [m] of a digit
     for region in regions.regions:
         number = region.name.partition("_")[2]
         middle, clearance = innermost(region)
-        half = 0.5 * FONT_SIZE * np.hypot(_DIGIT * len(number), 1.0) * point
-        if half <= clearance:
+        if 0.5 * height * np.hypot(_DIGIT * len(number), 1.0) <= clearance:
             axis.text(
-                *middle,
+                middle[0],
+                middle[1],
                 number,
                 ha="center",
                 va="center",

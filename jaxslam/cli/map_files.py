@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
-from jaxslam.io import graphml, lif, nav2_lanes, rmf_graph, rooms_file
+from jaxslam.io import graphml, lif, nav2_lanes, rmf_graph
 from jaxslam.io.straight_lanes import straight_lanes
 
 
@@ -41,7 +41,7 @@ def draw_map(
     figure, axis = canvas.map_canvas(*canvas.extent(maps.known_corners(occupancy)))
     maps.draw_occupancy(axis, occupancy)
     if regions is not None:
-        rooms.draw_rooms(axis, regions, rooms_file.region_colours(regions))
+        rooms.draw_rooms(axis, regions)
     maps.draw_topological_map(axis, graph)
     canvas.legend(figure)
     canvas.save(figure, path)

@@ -100,14 +100,14 @@ def draw_route(
 ) -> None:
     """Draw a route over a topological map, and over the occupancy map and the rooms if known."""
     # Imported here, because matplotlib is slow to import.
-    from jaxslam.viz import canvas, maps, routes
+    from jaxslam.viz import canvas, maps, rooms, routes
 
     corners = np.zeros((0, 2)) if occupancy is None else maps.known_corners(occupancy)
     figure, axis = canvas.map_canvas(*canvas.extent(corners, graph.xy, planned.line))
     if occupancy is not None:
         maps.draw_occupancy(axis, occupancy)
     if regions is not None:
-        routes.draw_regions(axis, regions)
+        rooms.draw_rooms(axis, regions)
     maps.draw_arcs(axis, graph)
     routes.draw_route(axis, planned)
     maps.draw_start_and_end(axis, np.pad(planned.line, ((0, 0), (0, 1))))

@@ -1,10 +1,13 @@
 """Rooms, corridors and halls of a map, and the doors between them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 REGION_KINDS = ("room", "corridor", "hall")
+_SAMPLES = 40_000  # points in the bounding box of a region, of which one is the innermost
 
 
 class Region(NamedTuple):
@@ -17,6 +20,7 @@ class Region(NamedTuple):
         area: [m^2] of its free cells.
         doors: Indices of its doors.
         neighbours: Indices of the regions that it shares a door with.
+        holes: (n >= 3, 2) [m] its inner boundaries, map frame, clockwise, open.
     """
 
     name: str
@@ -25,6 +29,7 @@ class Region(NamedTuple):
     area: float
     doors: tuple[int, ...]
     neighbours: tuple[int, ...]
+    holes: tuple[np.ndarray, ...] = ()
 
 
 class Door(NamedTuple):
@@ -81,3 +86,62 @@ class PlannerData(NamedTuple):
     arc_region: np.ndarray
     arc_doors: tuple[tuple[int, ...], ...]
     arc_widths: tuple[np.ndarray, ...]
+
+
+def signed_area(ring: np.ndarray) -> float:
+    """Area [m^2] that a closed ring (n, 2) [m] encloses, negative if it is clockwise."""
+    x, y = (ring - ring[0]).T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+def outer_first(regions: Sequence[Region]) -> list[int]:
+    """Indices of regions, those with large polygons first.
+
+    Of regions whose holes are not known, the last one that contains a point is the innermost.
+    """
+    return sorted(range(len(regions)), key=lambda k: (-abs(signed_area(regions[k].polygon)), k))
+
+
+def contains(region: Region, points: np.ndarray) -> np.ndarray:
+    """Whether points (N, 2) [m, map frame] lie in a region: a ray crosses its rings an odd number.
+
+    Returns:
+        (N,) bool.
+    """
+    rings = region.polygon, *region.holes
+    start = np.concatenate(rings)
+    end = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
+    across, up = (end - start).T
+    slope = across / np.where(up == 0.0, 1.0, up)
+    order = np.argsort(points[:, 1], kind="stable")
+    x, y = points[order].T
+    first, last = np.searchsorted(y, np.sort([start[:, 1], end[:, 1]], axis=0))
+    odd = np.zeros(len(points), bool)
+    for k in np.flatnonzero(first < last).tolist():
+        spanned = slice(first[k], last[k])
+        odd[spanned] ^= x[spanned] < start[k, 0] + slope[k] * (y[spanned] - start[k, 1])
+    inside = np.zeros(len(points), bool)
+    inside[order] = odd
+    return inside
+
+
+def innermost(region: Region) -> tuple[np.ndarray, float]:
+    """The point of a region that is farthest from its border, the middle one of several.
+
+    Returns:
+        The point (2,) [m, map frame], and its distance [m] to the border or a little less.
+    """
+    low, high = region.polygon.min(axis=0), region.polygon.max(axis=0)
+    size = np.maximum(high - low, 1e-9)
+    step = max(float(np.sqrt(np.prod(size) / _SAMPLES)), 1e-3 * float(size.max()))
+    shape = np.ceil(size / step).astype(int)
+    from_middle = np.indices(shape).reshape(2, -1).T - 0.5 * (shape - 1)
+    points = 0.5 * (low + high) + step * from_middle
+    inside = contains(region, points)
+    if not inside.any():
+        return np.asarray(region.polygon[0]), 0.0
+    distance = ndimage.distance_transform_edt(np.pad(inside.reshape(shape), 1))[1:-1, 1:-1].ravel()
+    middle = points[inside].mean(axis=0)
+    candidates = np.flatnonzero(distance > distance.max() - 1.0)
+    best = candidates[np.hypot(*(points[candidates] - middle).T).argmin()]
+    return points[best], max(float(distance[best]) - 1.5, 0.0) * step

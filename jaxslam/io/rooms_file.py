@@ -3,8 +3,10 @@
     {"format": "jaxslam-rooms", "version": 1, "frame": "map", "units": "m, m^2",
      "last_numbers": {"room": N, "door": N},    highest that were ever in a name
      "resolution": [m], "origin": [x, y, yaw],  of the cells of the map [m, m, rad]
-     "rooms": [{"name": "room_1", "kind": "room", "polygon": [[x, y], ...], "area": [m^2],
-               "doors": [names], "neighbours": [names], "colour": [r, g, b] in rooms.png}],
+     "rooms": [{"name": "room_1", "kind": "room", "polygon": [[x, y], ...],
+               "holes": [[[x, y], ...], ...] in it,   a file without is read, too
+               "area": [m^2], "doors": [names], "neighbours": [names],
+               "colour": [r, g, b] in rooms.png}],
      "doors": [{"name": "door_1", "position": [x, y], "jambs": [[x, y], [x, y]], "width": [m],
                 "rooms": [names of the two]}]}
 
@@ -12,7 +14,6 @@
 Black is no region. Names and colours of regions stay from one session to the next.
 """
 
-import colorsys
 import math
 from collections.abc import Sequence
 from os import PathLike
@@ -25,6 +26,7 @@ from jaxslam.core.regions import REGION_KINDS, Door, Region, Regions
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace, write_json_rows
+from jaxslam.io.room_colours import region_colours
 from jaxslam.mapping.region_names import number_of
 
 JSON_NAME, PNG_NAME = "rooms.json", "rooms.png"
@@ -57,6 +59,7 @@ def write_rooms(folder: str | PathLike, regions: Regions) -> None:
                 "name": region.name,
                 "kind": region.kind,
                 "polygon": np.round(region.polygon, 4),
+                "holes": [np.round(hole, 4) for hole in region.holes],
                 "area": round(region.area, 4),
                 "doors": [doors[k] for k in region.doors],
                 "neighbours": [names[k] for k in region.neighbours],
@@ -80,30 +83,6 @@ def write_rooms(folder: str | PathLike, regions: Regions) -> None:
     with replace(Path(folder) / PNG_NAME) as file:
         picture.save(file, format="PNG")
     write_json_rows(Path(folder) / JSON_NAME, content)
-
-
-def region_colours(regions: Regions) -> np.ndarray:
-    """Colour (R, 3) uint8 of each region, by the number in its name; no two are the same."""
-    found: dict[tuple[int, ...], None] = {}
-    for region in regions.regions:
-        number = number_of(region.name)
-        hue, shade = (0.6180339887 * number) % 1.0, number // 7 % 3
-        level = colorsys.hsv_to_rgb(hue, (0.45, 0.6, 0.3)[shade], (0.95, 0.8, 0.88)[shade])
-        colour = tuple(round(255.0 * x) for x in level)
-        while colour in found:
-            colour = _next_colour(colour)
-        found[colour] = None
-    return np.array(list(found), np.uint8).reshape(-1, 3)
-
-
-def _next_colour(colour: tuple[int, ...]) -> tuple[int, ...]:
-    """The colour after another; blue counts fastest, and all levels stay between 1 and 254."""
-    levels = list(colour)
-    for channel in (2, 1, 0):
-        levels[channel] = levels[channel] % 254 + 1
-        if levels[channel] > 1:
-            break
-    return tuple(levels)
 
 
 def read_rooms(path: str | PathLike) -> Regions:
@@ -201,6 +180,13 @@ class _Reader:
         check(item.get(key), shape)
         return np.array(item[key], float).reshape(shape)
 
+    def _ring(self, item: dict[str, Any], key: str, where: str) -> np.ndarray:
+        """The corners (n >= 3, 2) of a closed line."""
+        ring = self._numbers(item, key, (-1, 2), where)
+        if len(ring) < 3:
+            self._refuse("has fewer than 3 points", f"{where}.{key}")
+        return ring
+
     def _names(self, items: Sequence[dict[str, Any]], key: str, last: int) -> dict[str, int]:
         """Index of each item by its name."""
         kind = "room" if key == "rooms" else "door"
@@ -229,7 +215,7 @@ class _Reader:
     def _door(self, item: dict[str, Any], where: str, names: dict[str, int]) -> Door:
         sides = self._named(item, "rooms", where, names)
         if len(sides) != 2 or sides[0] == sides[1]:
-            self._refuse("are not two regions", f"{where}.regions")
+            self._refuse("are not two regions", f"{where}.rooms")
         width = float(self._numbers(item, "width", (), where))
         if width <= 0.0:
             self._refuse("is not positive", f"{where}.width")
@@ -249,9 +235,9 @@ class _Reader:
         kind = self._member(item, "kind", str, where)
         if kind not in REGION_KINDS:
             self._refuse(f"is none of {', '.join(REGION_KINDS)}", f"{where}.kind")
-        polygon = self._numbers(item, "polygon", (-1, 2), where)
-        if len(polygon) < 3:
-            self._refuse("has fewer than 3 points", f"{where}.polygon")
+        polygon = self._ring(item, "polygon", where)
+        holes = self._member({"holes": [], **item}, "holes", list, where)
+        rings = {f"holes[{k}]": hole for k, hole in enumerate(holes)}
         area = float(self._numbers(item, "area", (), where))
         if area <= 0.0:
             self._refuse("is not positive", f"{where}.area")
@@ -261,4 +247,5 @@ class _Reader:
         neighbours = self._named(item, "neighbours", where, names)
         if sorted(neighbours) != sorted({r for k in own for r in doors[k].regions} - {index}):
             self._refuse("are not the regions behind its doors", f"{where}.neighbours")
-        return Region(item["name"], kind, polygon, area, own, neighbours)
+        cut_out = tuple(self._ring(rings, key, where) for key in rings)
+        return Region(item["name"], kind, polygon, area, own, neighbours, cut_out)

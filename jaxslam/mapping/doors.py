@@ -14,6 +14,7 @@ import numpy as np
 from jaxslam.mapping.gaps import Gaps, Passages, find_gaps, line_cells, narrowest, take
 
 WIDENING = 1.25  # of free space beside a door, at least, relative to the width of the door
+MIN_WIDENING = 2.5  # [cells] at least: walls at an angle to the grid have steps, on both sides
 REACH = 1.0  # [m] to each side of a gap in which space widens: walls are thinner
 WALL = 0.4  # [m] to each side of a door that may belong to its frame
 MAX_WIDTH = 6.0  # [m] of an opening between two regions
@@ -74,7 +75,7 @@ class _Search:
         self._normal = passages.gaps.normal
         self._ahead = np.arange(1.0, REACH / resolution + 0.5)  # [cells]
         # The margin holds all points that are looked up.
-        self._margin = int(HALL_RANGE * MAX_WIDTH / resolution) + 2
+        self._margin = int(HALL_RANGE * MAX_WIDTH / resolution) + 6
         # Number of obstacles in each cell, doors included.
         self._obstacles = np.pad((~free).astype(np.int16), self._margin, constant_values=1)
         self._frames: dict[int, np.ndarray] = {}
@@ -109,7 +110,7 @@ class _Search:
         """Whether free space is wider than gaps on their two sides.
 
         It is if for half of the distances within `REACH`, the line at that distance parallel to the
-        gap is at least `WIDENING` times as long.
+        gap is at least `WIDENING` times as long, and longer by `MIN_WIDENING`.
 
         Args:
             chosen: (n,) indices of gaps, narrow ones first.
@@ -130,7 +131,8 @@ class _Search:
     def _widens(self, chosen: np.ndarray) -> np.ndarray:
         """As `widens`, for few gaps of similar width."""
         gaps, ahead = self._gaps, self._ahead
-        needed = WIDENING * gaps.width[chosen]
+        width = gaps.width[chosen]
+        needed = np.maximum(WIDENING * width, width + MIN_WIDENING)
         steps = np.arange(0.0, needed.max() + 1.0, _STEP)
         # axes: gap, side, distance ahead, direction along the gap, step
         forward = self._normal[chosen][:, None] * np.array([1.0, -1.0])[:, None]

@@ -54,10 +54,11 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
 
     With d the larger of the distances of two neighbouring cells to their feet f1 and f2, these
     appear under an angle of at least `FACING_ANGLE` if |f1 - f2| >= 2 d sin(angle / 2); at a local
-    minimum of the clearance along the medial axis it is 180 degrees.
+    minimum of the clearance along the medial axis it is 180 degrees. In a passage one cell wide the
+    medial axis goes through the cells, not between two: the obstacles on both sides are the feet.
 
     Args:
-        free: (H, W) bool.
+        free: (H, W) bool; cells at the border of the grid are not free.
         distance: (H, W) [cells] to the edge of the nearest obstacle.
         nearest: (2, H, W) int index of that obstacle.
 
@@ -78,7 +79,28 @@ def find_gaps(free: np.ndarray, distance: np.ndarray, nearest: np.ndarray) -> Ga
             larger = np.maximum(far[low].ravel()[pair], far[high].ravel()[pair]) + 0.5
             facing = np.hypot(*(first - second)) >= factor * larger
             found.append(np.stack([first[:, facing].T, second[:, facing].T], axis=1))
-    return gaps_between(np.unique(np.concatenate(found), axis=0))
+    for side in np.eye(2, dtype=np.int64):
+        before, after = (np.roll(free, step, axis=(0, 1)) for step in (side, -side))
+        narrow = np.argwhere(free & ~before & ~after)
+        found.append(np.stack([narrow - side, narrow + side], axis=1))
+    feet = np.unique(np.concatenate(found), axis=0)
+    return gaps_between(feet[~_at_a_step(free, feet)])
+
+
+def _at_a_step(free: np.ndarray, feet: np.ndarray) -> np.ndarray:
+    """Which pairs of feet (K, 2, 2) have an obstacle that touches both, as at a step of a wall.
+
+    # f1
+      #  f2      no passage, though a free cell below the step is near to both
+    """
+    middle = feet.sum(axis=1) // 2
+    touched = np.zeros(len(feet), bool)
+    last = np.array(free.shape)[:, None] - 1
+    for step in np.argwhere(np.ones((3, 3), bool)) - 1:
+        cell = middle + step
+        beside = np.abs(feet - cell[:, None]).max(axis=(1, 2)) == 1
+        touched |= beside & ~free[tuple(np.clip(cell.T, 0, last))]
+    return touched
 
 
 class Passages:

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
 from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.pairing import one_to_one
 from jaxslam.mapping.open_space import FreeSpace
 from jaxslam.mapping.plane_graph import Line, PlaneGraph
 
@@ -59,20 +60,14 @@ def place_landmarks(
     usable = np.flatnonzero((left > 0.0) & (left >= CONTRADICTED * clearance))
     radius = np.minimum(SAME_PLACE, 0.5 * clearance)
     ends = np.union1d(np.flatnonzero(graph.degrees() != 2), list(junctions or ())).astype(int)
-    pairs = []
-    if len(ends) and len(usable):
-        tree = cKDTree(np.array(graph.xy)[ends])
-        for k in usable.tolist():
-            for near in tree.query_ball_point(xy[k], radius[k]):
-                node = int(ends[near])
-                pairs.append((float(np.hypot(*(graph.xy[node] - xy[k]))), k, node))
-    placed: set[int] = set()
-    for distance, k, node in sorted(pairs):
-        if node not in names and k not in placed:
-            names[node] = k
-            placed.add(k)
-            if distance <= ACCURACY:
-                _move(graph, node, xy[k], space)
+    nodes = np.array(graph.xy).reshape(-1, 2)[ends]
+    placed = set()
+    for chosen, end in _nearest_pairs(xy[usable], nodes, radius[usable]).items():
+        k, node = int(usable[chosen]), int(ends[end])
+        names[node] = k
+        placed.add(k)
+        if np.hypot(*(nodes[end] - xy[k])) <= ACCURACY:
+            _move(graph, node, xy[k], space)
     for k in usable.tolist() if junctions is None else ():
         if k in placed:
             continue
@@ -90,6 +85,17 @@ def place_landmarks(
             graph.add_arc(Line(root, node, line, False))
         names[node] = k
     return names
+
+
+def _nearest_pairs(
+    first: np.ndarray, second: np.ndarray, radius: float | np.ndarray
+) -> dict[int, int]:
+    """Indices of partners, by those of points (N, 2) [m] of which they (M, 2) lie in a radius."""
+    if not len(first) or not len(second):
+        return {}
+    near = cKDTree(second).query_ball_point(first, radius)
+    pairs = np.array([(a, b) for a, others in enumerate(near) for b in others], int).reshape(-1, 2)
+    return one_to_one(pairs, np.hypot(*(second[pairs[:, 1]] - first[pairs[:, 0]]).T))
 
 
 def _move(graph: PlaneGraph, node: int, xy: np.ndarray, space: FreeSpace) -> None:
@@ -131,21 +137,8 @@ def kept_ids(
     if previous is not None and len(previous.id):
         old = np.flatnonzero(~np.isin(previous.id, ids))
         new = np.flatnonzero(~np.isin(ids, previous.id))
-        if len(old) and len(new):
-            tree = cKDTree(xy[new])
-            near = tree.query_ball_point(previous.xy[old], SAME_NODE)
-            pairs = sorted(
-                (float(np.hypot(*(xy[new[n]] - previous.xy[old[k]]))), int(old[k]), int(new[n]))
-                for k, members in enumerate(near)
-                for n in members
-            )
-            used: set[int] = set()
-            named: set[int] = set()
-            for _, k, n in pairs:
-                if n not in named and k not in used:
-                    ids[n] = previous.id[k]
-                    used.add(k)
-                    named.add(n)
+        for k, n in _nearest_pairs(previous.xy[old], xy[new], SAME_NODE).items():
+            ids[new[n]] = previous.id[old[k]]
     fresh = np.flatnonzero(ids < 0)
     ids[fresh] = next_id + np.arange(len(fresh))
     return ids, next_id + len(fresh)

@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
-from jaxslam.core.regions import Door, PlannerData, Regions
+from jaxslam.core.regions import Door, PlannerData, Regions, contains, outer_first
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.mapping.clearance import clearance_at, clearance_field
 
@@ -72,7 +72,7 @@ def most_common(region: np.ndarray) -> int:
 def region_at(regions: Regions, points: np.ndarray) -> np.ndarray:
     """Index (N,) of the region that points (N, 2) [m, map frame] lie in, -1 for none.
 
-    By the cells of the map; by the polygons if there are none, the smallest that holds the point.
+    By the cells of the map, or by the polygons if there are none.
     """
     found = np.full(len(points), -1)
     if regions.label.size:
@@ -80,19 +80,9 @@ def region_at(regions: Regions, points: np.ndarray) -> np.ndarray:
         inside = np.all((cell >= 0) & (cell < regions.label.shape), axis=1)
         found[inside] = regions.label[tuple(cell[inside].T)] - 1
         return found
-    order = sorted(range(len(regions.regions)), key=lambda k: -regions.regions[k].area)
-    for k in order:
-        found[_in_polygon(regions.regions[k].polygon, points)] = k
+    for k in outer_first(regions.regions):
+        found[contains(regions.regions[k], points)] = k
     return found
-
-
-def _in_polygon(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points (N, 2) lie in a polygon (n, 2): a ray from them crosses it an odd number."""
-    (x, y), (next_x, next_y) = polygon.T, np.roll(polygon, -1, axis=0).T
-    spans = (y > points[:, 1:]) != (next_y > points[:, 1:])
-    slope = (next_x - x) / np.where(next_y == y, 1.0, next_y - y)
-    right = points[:, :1] < x + slope * (points[:, 1:] - y)
-    return np.count_nonzero(spans & right, axis=1) % 2 == 1
 
 
 def doors_crossed(doors: tuple[Door, ...], line: np.ndarray) -> list[tuple[int, int]]:

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxslam.core.regions import Door, Regions
-from jaxslam.core.se2_np import inverse_transform
+from jaxslam.core.pairing import one_to_one
+from jaxslam.core.regions import Door, Regions, contains, outer_first
+from jaxslam.core.se2_np import inverse_transform, transform
 
 MIN_OVERLAP = 0.5  # of the smaller of two regions that are the same one
 DOOR_DISTANCE = 0.5  # [m] between doors that are the same one, at most
@@ -69,8 +70,7 @@ def _same_regions(found: Regions, old: Regions) -> dict[int, int]:
     sizes = counts.sum(axis=1)[1:], counts.sum(axis=0)[1:]
     shared = counts[1:, 1:]
     enough = (shared > 0) & (shared >= MIN_OVERLAP * np.minimum.outer(*sizes))
-    pairs = np.argwhere(enough)
-    return _one_to_one(pairs[np.lexsort((*pairs.T[::-1], -shared[enough]))])
+    return one_to_one(np.argwhere(enough), -shared[enough])
 
 
 def _same_doors(found: Sequence[Door], old: Sequence[Door]) -> dict[int, int]:
@@ -78,48 +78,22 @@ def _same_doors(found: Sequence[Door], old: Sequence[Door]) -> dict[int, int]:
     here = np.array([door.xy for door in found], float).reshape(-1, 1, 2)
     there = np.array([door.xy for door in old], float).reshape(1, -1, 2)
     distance = np.linalg.norm(here - there, axis=2)
-    pairs = np.argwhere(distance <= DOOR_DISTANCE)
-    return _one_to_one(pairs[np.lexsort((*pairs.T[::-1], distance[tuple(pairs.T)]))])
-
-
-def _one_to_one(pairs: np.ndarray) -> dict[int, int]:
-    """The first pair (n, 2) of each index, on both sides."""
-    same: dict[int, int] = {}
-    taken: set[int] = set()
-    for k, other in pairs.tolist():
-        if k not in same and other not in taken:
-            same[k] = other
-            taken.add(other)
-    return same
+    near = distance <= DOOR_DISTANCE
+    return one_to_one(np.argwhere(near), distance[near])
 
 
 def _rasterised(old: Regions, grid: Regions) -> np.ndarray:
-    """Earlier region (H, W) int64 of each cell of a grid, from 1 on; 0 for none.
-
-    Polygons are outer boundaries: a smaller region inside a larger one's polygon is not part of it.
-    """
+    """Earlier region (H, W) int64 of each cell of a grid, from 1 on; 0 for none."""
     earlier = np.zeros(grid.label.shape, np.int64)
-    for k in sorted(range(len(old.regions)), key=lambda k: (-_area(old.regions[k].polygon), k)):
-        corners = inverse_transform(grid.origin, old.regions[k].polygon) / grid.resolution - 0.5
+    for k in outer_first(old.regions):
+        corners = inverse_transform(grid.origin, old.regions[k].polygon) / grid.resolution
         low = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, earlier.shape)
-        high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, 0, earlier.shape)
-        inside = np.zeros(np.maximum(high - low, 0) + np.array([0, 1]), np.int64)
-        rows = np.arange(low[0], high[0])
-        for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            crossed = np.flatnonzero((x0 <= rows) != (x1 <= rows))
-            if crossed.size:
-                y = y0 + (rows[crossed] - x0) / (x1 - x0) * (y1 - y0)
-                column = np.clip(np.ceil(y).astype(int) - low[1], 0, inside.shape[1] - 1)
-                inside[crossed, column] += 1
-        odd = np.cumsum(inside, axis=1)[:, :-1] % 2 == 1
-        earlier[low[0] : high[0], low[1] : high[1]][odd] = k + 1
+        high = np.clip(np.ceil(corners.max(axis=0)).astype(int), 0, earlier.shape)
+        window = earlier[low[0] : high[0], low[1] : high[1]]
+        cells = np.indices(window.shape).reshape(2, -1).T + low + 0.5
+        centres = transform(grid.origin, cells * grid.resolution)
+        window[contains(old.regions[k], centres).reshape(window.shape)] = k + 1
     return earlier
-
-
-def _area(polygon: np.ndarray) -> float:
-    """Area of a polygon (n, 2), counter-clockwise."""
-    x, y = (polygon - polygon[0]).T
-    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def _sorted_regions(found: Regions, numbers: Sequence[int]) -> Regions:

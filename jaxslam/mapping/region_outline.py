@@ -1,4 +1,4 @@
-"""Outer boundaries of labelled cells, as polygons."""
+"""Boundaries of labelled cells, as polygons with holes."""
 
 import numpy as np
 from scipy import ndimage
@@ -8,11 +8,12 @@ from jaxslam.core import polylines
 TOLERANCE = 1.0  # [cells] of a polygon
 
 
-def outlines(label: np.ndarray, count: int) -> list[np.ndarray]:
-    """Outer boundary (n, 2) [cells] of each of the labels 1 to `count`, counter-clockwise.
+def outlines(label: np.ndarray, count: int) -> list[list[np.ndarray]]:
+    """Boundaries (n, 2) [cells] of each of the labels 1 to `count`.
 
-    The largest part of a label is outlined if it has several; its holes are not. Cell [i, j] is the
-    square from (i, j) to (i + 1, j + 1).
+    The first of a label is its outer one, counter-clockwise; others are those of its holes,
+    clockwise. If it has several parts, they are those of the largest. Cell [i, j] is the square
+    from (i, j) to (i + 1, j + 1).
 
     Args:
         label: (H, W) int.
@@ -23,15 +24,15 @@ def outlines(label: np.ndarray, count: int) -> list[np.ndarray]:
         corner = np.array([side.start for side in box])
         cells, parts = ndimage.label(np.pad(label[box] == k, 1))
         largest = np.bincount(cells.ravel())[1:].argmax() + 1 if parts > 1 else 1
-        found.append(_simplified(_boundary(cells == largest)) + corner - 1.0)
+        found.append([_simplified(loop) + corner - 1.0 for loop in _boundaries(cells == largest)])
     return found
 
 
-def _boundary(cells: np.ndarray) -> np.ndarray:
-    """Corners (n, 2) of the outer boundary of connected cells (H, W) bool; the border is not set.
+def _boundaries(cells: np.ndarray) -> list[np.ndarray]:
+    """Corners (n, 2) of the boundaries of connected cells (H, W) bool; the border is not set.
 
-    Each side of a cell whose neighbour is not set is an edge with the cell on its left. Where two
-    cells meet in a corner alone, the boundary stays with its cell:
+    The first is the outer one. Each side of a cell whose neighbour is not set is an edge with the
+    cell on its left. Where two cells meet in a corner alone, the boundary stays with its cell:
 
         # .         a turn to the left wherever there is a choice
         . #
@@ -60,13 +61,19 @@ def _boundary(cells: np.ndarray) -> np.ndarray:
         nxt = number((turns + change) % 4, *ends.T)
         follower = np.where(nxt >= 0, nxt, follower)
     start = int(np.searchsorted(turns, 3))  # of the first cell, which has no neighbour before it
+    corners = np.stack([rows, columns], axis=1).astype(float)
     following = follower.tolist()
-    loop, edge = [start], following[start]
-    while edge != start:
-        loop.append(edge)
-        edge = following[edge]
-    is_corner = turns[loop] != np.roll(turns[loop], 1)
-    return np.stack([rows, columns], axis=1)[loop][is_corner].astype(float)
+    waiting = dict.fromkeys([start, *range(len(turns))])
+    found = []
+    while waiting:
+        loop, edge = [], next(iter(waiting))
+        while edge in waiting:
+            del waiting[edge]
+            loop.append(edge)
+            edge = following[edge]
+        is_corner = turns[loop] != np.roll(turns[loop], 1)
+        found.append(corners[loop][is_corner])
+    return found
 
 
 def _simplified(polygon: np.ndarray) -> np.ndarray:
@@ -76,4 +83,5 @@ def _simplified(polygon: np.ndarray) -> np.ndarray:
     loop = np.concatenate([loop, loop[:1]])
     middle = int(np.hypot(*(loop - loop[0]).T).argmax())
     halves = loop[: middle + 1], loop[middle:]
-    return np.concatenate([polylines.simplify(half, TOLERANCE)[:-1] for half in halves])
+    fewer = np.concatenate([polylines.simplify(half, TOLERANCE)[:-1] for half in halves])
+    return fewer if len(fewer) > 2 else polygon

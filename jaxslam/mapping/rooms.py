@@ -18,15 +18,18 @@ from jaxslam.core.types import as_float64, check_array
 from jaxslam.mapping import medial_axis, region_names
 from jaxslam.mapping.doors import find_doors
 from jaxslam.mapping.gaps import Gaps, take
-from jaxslam.mapping.region_merging import divide, largest
+from jaxslam.mapping.region_merging import divide
 from jaxslam.mapping.region_outline import outlines
 
 FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
 MIN_AREA = 1.0  # [m^2] of a region
 MIN_CLOSED_AREA = 5.0  # [m^2] of a region without a door
-CORRIDOR_LENGTH = 3.0  # length of a corridor, at least, relative to its largest width
+CORRIDOR_LENGTH = 3.0  # length of a corridor, at least, relative to its width
+CORRIDOR_WIDTH = 4.0  # [m] of most of a corridor, at most
+WIDER_SHARE = 0.25  # of a corridor that may be wider than its length allows, less than
 OUTSIDE_SHARE = 0.5  # of the border of a grid that lies outside, more than
-HALL_AREA = 50.0  # [m^2] of a hall, at least
+HALL_AREA = 50.0  # [m^2] of a hall, at least, or
+HALL_WIDTH = 7.0  # [m] of the largest circle in it
 
 
 def find_regions(
@@ -43,7 +46,10 @@ def find_regions(
     A region is free space in which the robot fits, at least `MIN_AREA` large (`MIN_CLOSED_AREA`
     without a door), whether or not the robot fits through its doors. Small free-standing obstacles
     belong to the region around them, but not to its area. Free space along most of the border of
-    the grid is outside, no region.
+    the grid, on all four sides, is outside, no region, unless there is no other region.
+
+    A corridor is long for its width, and narrow: little of it is wider than its length allows. A
+    hall is no corridor, and large or wide; all else is a room.
 
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
@@ -85,14 +91,13 @@ def find_regions(
     )
     kept = _has_door(cells, sides, MIN_CLOSED_AREA / resolution**2)
     label[box] = cells[1:-1, 1:-1]
-    kept &= ~_is_outside(label, len(kept))
+    kept &= ~_is_outside(label, kept)
     number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
     label, cells, sides = number[label], number[cells], number[sides]
     corner = np.array([side.start for side in box])
     gaps = gaps._replace(feet=gaps.feet - 1 + corner, middle=gaps.middle - 1.0 + corner)
-    radius = largest(distance, cells, int(number.max()))[1:] * resolution
-    area = np.bincount(label[free], minlength=len(radius) + 1)[1:] * resolution**2
-    regions = _regions(label, area, radius, resolution, origin)
+    area = np.bincount(label[free], minlength=int(number.max()) + 1)[1:] * resolution**2
+    regions = _regions(label, area, resolution, origin)
     found = Regions(label, regions, (), resolution, origin)
     return region_names.named(_with_doors(found, gaps, sides), previous)
 
@@ -131,12 +136,13 @@ def _has_door(label: np.ndarray, sides: np.ndarray, min_area: float) -> np.ndarr
     return kept
 
 
-def _is_outside(label: np.ndarray, count: int) -> np.ndarray:
-    """Which labels (count,) lie along most of the border of the grid; not 0."""
-    border = np.concatenate([label[0], label[-1], label[1:-1, 0], label[1:-1, -1]])
-    outside = np.bincount(border, minlength=count) > OUTSIDE_SHARE * len(border)
-    outside[0] = False
-    return outside
+def _is_outside(label: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Which of the `kept` labels (L + 1,) lie around all others: along most of the border."""
+    sides = label[0], label[-1], label[1:-1, 0], label[1:-1, -1]
+    counts = np.stack([np.bincount(side, minlength=len(kept)) for side in sides])
+    total = sum(len(side) for side in sides)
+    outside = kept & (counts.sum(axis=0) > OUTSIDE_SHARE * total) & (counts > 0).all(axis=0)
+    return outside & (kept.sum() > 1)
 
 
 def _to_map(points: np.ndarray, resolution: float, origin: np.ndarray) -> np.ndarray:
@@ -145,19 +151,46 @@ def _to_map(points: np.ndarray, resolution: float, origin: np.ndarray) -> np.nda
 
 
 def _regions(
-    label: np.ndarray,
-    area: np.ndarray,
-    radius: np.ndarray,
-    resolution: float,
-    origin: np.ndarray,
+    label: np.ndarray, area: np.ndarray, resolution: float, origin: np.ndarray
 ) -> tuple[Region, ...]:
-    """Regions of the labels, without names and doors; `area` [m^2] and `radius` [m] of each."""
+    """Regions of the labels, without names and doors; `area` [m^2] of each."""
     found = []
-    for k, polygon in enumerate(outlines(label, len(area))):
-        long = area[k] >= CORRIDOR_LENGTH * (2.0 * radius[k]) ** 2
-        kind = "corridor" if long else "hall" if area[k] >= HALL_AREA else "room"
-        found.append(Region("", kind, _to_map(polygon, resolution, origin), float(area[k]), (), ()))
+    boxes = ndimage.find_objects(label, len(area))
+    for k, (box, loops) in enumerate(zip(boxes, outlines(label, len(area)), strict=True)):
+        kind = _kind(label[box] == k + 1, float(area[k]), resolution)
+        polygon, *holes = (_to_map(loop, resolution, origin) for loop in loops)
+        found.append(Region("", kind, polygon, float(area[k]), (), (), tuple(holes)))
     return tuple(found)
+
+
+def _kind(cells: np.ndarray, area: float, resolution: float) -> str:
+    """Kind of a region of some cells (H, W) bool, of which `area` [m^2] is free.
+
+    A strip of the area A that is n times as long as wide has the width sqrt(A / n).
+    """
+    cells = np.pad(cells, 1)
+    distance = ndimage.distance_transform_edt(cells) - 0.5
+    most_wide = np.sqrt(cells.sum() / CORRIDOR_LENGTH)
+    is_long = _share(cells, distance, most_wide) < WIDER_SHARE
+    if is_long and _share(cells, distance, CORRIDOR_WIDTH / resolution) < 0.5:
+        return "corridor"
+    is_wide = 2.0 * distance.max() * resolution >= HALL_WIDTH
+    return "hall" if is_wide or area >= HALL_AREA else "room"
+
+
+def _share(cells: np.ndarray, distance: np.ndarray, width: float) -> float:
+    """Share of cells (H, W) bool in circles of a width [cells] that fit between the others.
+
+    Args:
+        cells: (H, W) bool.
+        distance: (H, W) [cells] to the edge of the nearest other cell.
+        width: [cells]
+    """
+    middle = distance >= 0.5 * width
+    if not middle.any():
+        return 0.0
+    covered = ndimage.distance_transform_edt(~middle) - 0.5 <= 0.5 * width
+    return float((cells & covered).sum() / cells.sum())
 
 
 def _with_doors(found: Regions, gaps: Gaps, sides: np.ndarray) -> Regions:

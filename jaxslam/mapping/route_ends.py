@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.core.regions import Regions
+from jaxslam.core.regions import Regions, innermost
 from jaxslam.core.types import as_float64
 from jaxslam.mapping.arc_points import ArcPoints
 from jaxslam.mapping.clearance import ClearanceField, clearance_at
@@ -87,7 +87,7 @@ def _middle(regions: Regions, index: int, field: ClearanceField | None) -> np.nd
     """The point (2,) [m] of a region that is farthest from obstacles."""
     polygon = regions.regions[index].polygon
     if field is None:
-        return np.asarray(polygon.mean(axis=0))
+        return innermost(regions.regions[index])[0]
     cells = np.floor(field.to_cells(polygon)).astype(int)
     low, high = (
         np.maximum(cells.min(axis=0), 0),
@@ -99,7 +99,7 @@ def _middle(regions: Regions, index: int, field: ClearanceField | None) -> np.nd
         low[0] : high[0], low[1] : high[1]
     ].ravel()
     if not inside.any():
-        return np.asarray(polygon.mean(axis=0))
+        return innermost(regions.regions[index])[0]
     return np.asarray(centres[np.argmax(np.where(inside, window.ravel(), -1.0))])
 
 

@@ -2,44 +2,37 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.transforms import Affine2D
-from numpy.typing import ArrayLike
-from scipy import ndimage
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.path import Path
 
-from jaxslam.core.regions import Regions
-from jaxslam.core.se2_np import transform
+from jaxslam.core.regions import Region, Regions, innermost, signed_area
+from jaxslam.io.room_colours import region_colours
 from jaxslam.viz.canvas import BLACK, GREY, PINK
 
 SHADE = 0.55  # opacity of the colours of rooms
-MAX_NAMES = 150  # rooms whose numbers are drawn
+FONT_SIZE = 5.0  # [points] of the numbers of rooms
+_DIGIT = 0.65  # width of a digit, relative to the font size
 
 
-def draw_rooms(axis: Axes, regions: Regions, colours: ArrayLike) -> None:
-    """Draw each region in its colour, with the number of its name, and a line across each door.
+def draw_rooms(axis: Axes, regions: Regions) -> None:
+    """Draw each region in its colour (`room_colours`), and a line across each door.
+
+    The number in its name stands where the region is widest, if it fits in there.
 
     Args:
-        axis: Axis to draw on, in the map frame [m].
-        regions: The regions, with their label (H, W).
-        colours: (R, 3) [0, 255] of the regions.
+        axis: Axis to draw on, in the map frame [m], with its limits set.
+        regions: The regions; of these only the polygons with their holes are drawn.
     """
-    palette = np.zeros((len(regions.regions) + 1, 4), np.uint8)
-    palette[1:, :3] = colours
-    palette[1:, 3] = round(255 * SHADE)
-    height, width = regions.label.shape
-    x, y, heading = regions.origin.tolist()
-    to_map = Affine2D().scale(regions.resolution).rotate(heading).translate(x, y)
-    limits = axis.get_xlim(), axis.get_ylim()
-    axis.imshow(
-        palette[regions.label.T],
-        origin="lower",
-        extent=(0, height, 0, width),
-        transform=to_map + axis.transData,
-        interpolation="none",
-        zorder=0.7,
-    )
-    axis.set(xlim=limits[0], ylim=limits[1], aspect="equal")
     if regions.regions:
+        axis.add_collection(
+            PathCollection(
+                [_path(region) for region in regions.regions],
+                facecolors=region_colours(regions) / 255.0,
+                edgecolors="none",
+                alpha=SHADE,
+                zorder=0.7,
+            )
+        )
         label = "room (colour), its number"
         axis.plot([], [], "s", color=GREY, alpha=SHADE, markersize=8, label=label)
         _draw_numbers(axis, regions)
@@ -56,15 +49,43 @@ def draw_rooms(axis: Axes, regions: Regions, colours: ArrayLike) -> None:
         )
 
 
+def _path(region: Region) -> Path:
+    """The rings of a region, the outer one counter-clockwise and its holes clockwise."""
+    rings = [region.polygon, *region.holes]
+    turns = [1.0, *(-1.0 for _ in region.holes)]
+    return Path.make_compound_path(
+        *(
+            Path(np.concatenate([ring, ring[:1]])[:: 1 if turn * signed_area(ring) > 0 else -1])
+            for ring, turn in zip(rings, turns, strict=True)
+        )
+    )
+
+
 def _draw_numbers(axis: Axes, regions: Regions) -> None:
-    """Write the numbers of the largest regions near their middles, inside them."""
-    largest = sorted(range(len(regions.regions)), key=lambda k: -regions.regions[k].area)
-    boxes = ndimage.find_objects(regions.label)
-    for k in largest[:MAX_NAMES]:
-        cells = np.argwhere(regions.label[boxes[k]] == k + 1) + [side.start for side in boxes[k]]
-        middle = cells[np.abs(cells - cells.mean(axis=0)).sum(axis=1).argmin()]
-        x, y = transform(regions.origin, (middle + 0.5) * regions.resolution).tolist()
-        number = regions.regions[k].name.partition("_")[2]
-        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.7, "linewidth": 0.0}
-        text = axis.text(x, y, number, fontsize=5, color=BLACK, bbox=box, in_layout=False)
-        text.set(ha="center", va="center")
+    """Write the number of each region that it fits in, over arcs and nodes, below all marks."""
+    (x, x_end), (y, y_end) = axis.get_xlim(), axis.get_ylim()
+    frame = axis.get_window_extent()  # [dots], before the layout, which makes it larger
+    dot = max((x_end - x) / frame.width, (y_end - y) / frame.height)  # [m]
+    height = FONT_SIZE * axis.figure.dpi / 72.0 * dot  # [m] of a digit
+    for region in regions.regions:
+        number = region.name.partition("_")[2]
+        middle, clearance = innermost(region)
+        if 0.5 * height * np.hypot(_DIGIT * len(number), 1.0) <= clearance:
+            axis.text(
+                middle[0],
+                middle[1],
+                number,
+                ha="center",
+                va="center",
+                fontsize=FONT_SIZE,
+                color=BLACK,
+                zorder=2.2,
+                clip_on=True,
+                in_layout=False,
+                bbox={
+                    "boxstyle": "round,pad=0.1",
+                    "facecolor": "white",
+                    "alpha": 0.7,
+                    "linewidth": 0.0,
+                },
+            )

@@ -3,9 +3,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from jaxslam.core import se2_np
 from jaxslam.core.regions import Regions
 from jaxslam.mapping import region_names, region_outline, rooms
 from jaxslam.mapping.gaps import gaps_between, line_cells
+from jaxslam.mapping.planner_data import region_at
 from jaxslam.mapping.rooms import find_regions
 
 CELL = 0.05
@@ -58,8 +60,9 @@ def check_records(found, free):
         assert region.doors == tuple(i for i, d in enumerate(found.doors) if k in d.regions)
         behind = {r for i in region.doors for r in found.doors[i].regions} - {k}
         assert set(region.neighbours) == behind
-        x, y = region.polygon.T
-        assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0.0
+        for ring, sign in ((region.polygon, 1.0), *((hole, -1.0) for hole in region.holes)):
+            x, y = ring.T
+            assert sign * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0.0
     for door in found.doors:
         assert door.regions[0] < door.regions[1]
         assert door.width == pytest.approx(np.hypot(*(door.jambs[1] - door.jambs[0])))
@@ -204,9 +207,21 @@ def test_what_surrounds_a_plan_is_no_region():
     assert len(found.doors) == 1
 
 
+def test_free_space_up_to_the_border_of_a_picture_is_a_room():
+    """The border bounds it like a wall: a plan without margins, or of one room."""
+    for free in (np.ones((80, 60), bool), np.pad(np.ones((78, 58), bool), ((2, 0), (0, 2)))):
+        (only,) = divided(free).regions
+        assert only.area == pytest.approx(free.sum() * CELL**2)
+    plan = two_rooms()[6:166, 6:86]  # a room of 60 % of the picture and one of 40 %
+    plan = np.concatenate([np.repeat(plan[:76], 2, axis=0), plan[76:]])
+    found = divided(plan)
+    assert len(found.regions) == 2 and len(found.doors) == 1
+    assert found.regions[0].area > 1.5 * found.regions[1].area
+
+
 @pytest.mark.parametrize("size", [(0, 0), (3, 7), (40, 40)])
 def test_maps_without_a_room(size):
-    for value in (True, False):
+    for value in (True, False) if max(size) < 40 else (False,):
         free = np.full(size, value)
         found = divided(free)
         assert isinstance(found, Regions) and not found.doors
@@ -270,8 +285,127 @@ def test_number_of_a_name():
 def test_outlines_do_not_join_cells_across_corners():
     label = np.zeros((6, 8), np.int32)
     label[1:3, 1:4] = label[3:5, 4:6] = 1  # two parts that touch in a corner
-    (polygon,) = region_outline.outlines(label, 1)
+    ((polygon,),) = region_outline.outlines(label, 1)
     np.testing.assert_array_equal(polygon, [[1, 1], [3, 1], [3, 4], [1, 4]])
+
+
+def test_outlines_of_few_cells_have_three_corners_at_least():
+    label = np.array([[1, 2, 2, 2, 2, 0, 3]], np.int32)
+    label = np.concatenate([label, [[0, 2, 0, 0, 2, 0, 0]], [[0, 2, 2, 2, 2, 0, 0]]])
+    for loops in region_outline.outlines(label.astype(np.int32), 3):
+        assert all(len(loop) >= 3 for loop in loops)
+
+
+def rings_and_rooms(rng):
+    """Free cells of rooms in rings of corridors in each other, turned, with doors at random."""
+    size = 260
+    x, y = np.indices((size, size)) - 0.5 * size
+    angle = rng.uniform(0.0, np.pi)
+    u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    stretch = rng.uniform(0.7, 1.0)
+    out = np.maximum(np.abs(u), np.abs(v) / stretch)
+    wide = rng.uniform(40.0, 50.0)  # of the room in the middle, larger than the ring
+    first, second = wide + rng.uniform([16.0, 34.0], [19.0, 41.0])
+    free = (out < wide) | ((out > wide + 4) & (out < first)) | ((out > first + 4) & (out < second))
+    for start in (wide, first):
+        side = rng.choice([-1.0, 1.0])
+        at = rng.uniform(-0.5, 0.5) * wide * stretch
+        free |= (side * u > start - 3) & (side * u < start + 7) & (np.abs(v - at) < 8.0)
+    return free
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_by_polygons_cells_lie_in_the_region_that_the_picture_has(seed):
+    """But for cells at the borders, as polygons are simplified by up to a cell."""
+    free = rings_and_rooms(np.random.default_rng(seed))
+    found = divided(free, origin=ORIGIN)
+    assert len(found.regions) >= 3 and any(region.holes for region in found.regions)
+    cells = np.argwhere(free)
+    centres = se2_np.transform(ORIGIN, (cells + 0.5) * CELL)
+    by_polygon = region_at(found._replace(label=np.zeros((0, 0), np.int32)), centres)
+    by_cell = found.label[tuple(cells.T)] - 1
+    assert np.mean(by_polygon == by_cell) > 0.97
+    inner = np.zeros(free.shape, bool)
+    for k in range(len(found.regions)):
+        inner |= ndimage.distance_transform_edt(found.label == k + 1) > 2.0
+    inner = inner[tuple(cells.T)]
+    assert inner.mean() > 0.7
+    np.testing.assert_array_equal(by_polygon[inner], by_cell[inner])
+
+
+def walled(rng, door, hole, thickness):
+    """A room of 6 x 6 m that a wall at a random angle divides, with a door and a hole [cells]."""
+    x, y = np.indices((130, 130)) - 65.0
+    angle = rng.choice([0.0, np.pi / 2, rng.uniform(0.0, np.pi)])
+    u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    is_open = (np.abs(v - 15.0) < 0.5 * door) | (np.abs(v + 20.0) <= 0.5 * hole)
+    wall = (np.abs(u) < max(0.5 * thickness, 0.75)) & ~is_open
+    return (np.maximum(np.abs(x), np.abs(y)) < 60) & ~wall
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_small_hole_in_a_wall_joins_no_rooms_and_hides_no_door(seed):
+    rng = np.random.default_rng(seed)
+    free = walled(rng, 9, rng.integers(1, 4), rng.integers(1, 4))
+    found = divided(free, resolution=0.1)
+    assert len(found.regions) >= 2
+    sides = {tuple(found.label[tuple(cell)] for cell in ((8, 8), (121, 121)))}
+    sides |= {tuple(found.label[tuple(cell)] for cell in ((8, 121), (121, 8)))}
+    assert any(a != b for a, b in sides)
+    assert any(door.width == pytest.approx(0.9, abs=0.2) for door in found.doors)
+
+
+@pytest.mark.parametrize("cell", [0.05, 0.2])
+def test_steps_of_walls_that_are_turned_divide_no_corridor(cell):
+    x, y = (np.indices((round(20 / cell),) * 2) + 0.5) * cell - 10.0
+    for angle in np.linspace(0.0, 1.5, 9):
+        c, s = np.cos(angle), np.sin(angle)
+        free = (np.abs(x * c + y * s) < 8.0) & (np.abs(y * c - x * s) < 0.75)
+        assert [region.kind for region in divided(free, resolution=cell).regions] == ["corridor"]
+
+
+@pytest.mark.parametrize("cell", [0.1, 1.0])
+def test_a_door_of_one_cell_is_a_door(cell):
+    free = np.zeros((60, 30), bool)
+    free[2:28, 2:28] = free[29:58, 2:28] = free[28, 12] = True
+    found = divided(free, resolution=cell)
+    assert len(found.regions) == 2
+    assert [door.width for door in found.doors] == [pytest.approx(cell)]
+
+
+def strips(*boxes):
+    return lambda u, v: np.any(
+        [(u >= x) & (u < x_end) & (v >= y) & (v < y_end) for x, x_end, y, y_end in boxes], axis=0
+    )
+
+
+KINDS = {
+    "L": (strips((-9, 9, -9, -7), (-9, -7, -9, 9)), "corridor"),
+    "T": (strips((-9, 9, -1.5, 1.5), (-1.5, 1.5, -9, 0)), "corridor"),
+    "plus": (strips((-9, 9, -1, 1), (-1, 1, -9, 9)), "corridor"),
+    "ring": (lambda u, v: np.abs(np.maximum(np.abs(u), np.abs(v)) - 8.0) <= 1.0, "corridor"),
+    "round ring": (lambda u, v: np.abs(np.hypot(u, v) - 8.0) <= 1.0, "corridor"),
+    "with a lobby": (lambda u, v: strips((-12, 12, -1, 1))(u, v) | (u**2 + v**2 < 4), "corridor"),
+    "short": (strips((-4, 4, -0.8, 0.8)), "corridor"),
+    "square of 100": (strips((-5, 5, -5, 5)), "hall"),
+    "circle of 100": (lambda u, v: np.hypot(u, v) < 5.64, "hall"),
+    "2:1 of 100": (strips((-7.07, 7.07, -3.535, 3.535)), "hall"),
+    "nave": (strips((-12, 12, -3, 3), (-12, -6, -9, 3)), "hall"),
+    "round hall": (lambda u, v: np.hypot(u, v) < 3.9, "hall"),
+    "square of 25": (strips((-2.5, 2.5, -2.5, 2.5)), "room"),
+    "2:1 of 32": (strips((-4, 4, -2, 2)), "room"),
+    "circle of 20": (lambda u, v: np.hypot(u, v) < 2.5, "room"),
+}
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4])
+@pytest.mark.parametrize("cell", [0.05, 0.2])
+@pytest.mark.parametrize("name", KINDS)
+def test_kinds_are_those_of_the_shape(name, cell, angle):
+    inside, kind = KINDS[name]
+    x, y = (np.indices((round(34 / cell),) * 2) + 0.5) * cell - 17.0
+    free = inside(x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle))
+    assert {region.kind for region in divided(free, resolution=cell).regions} == {kind}
 
 
 def test_lines_between_cells_are_connected():

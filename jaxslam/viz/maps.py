@@ -179,10 +179,11 @@ def known_corners(grid: OccupancyMap) -> np.ndarray:
     Raises:
         ValueError: No cell is known.
     """
-    known = np.argwhere(np.asarray(grid.occupied) | np.asarray(grid.free))
-    if not len(known):
+    known = np.asarray(grid.occupied) | np.asarray(grid.free)
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
         raise ValueError("grid has no known cell, neither occupied nor free")
-    low, high = known.min(axis=0), known.max(axis=0) + 1
+    low, high = (rows[0], columns[0]), (rows[-1] + 1, columns[-1] + 1)
     return _cells_to_map(grid).transform([low, (high[0], low[1]), high, (low[0], high[1])])
 
 

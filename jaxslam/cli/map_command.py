@@ -10,9 +10,9 @@ from tqdm import tqdm
 
 from jaxslam.cli import report, room_results, summaries
 from jaxslam.cli.options import OutFolder, check_range, name_errors
-from jaxslam.core.maps import OccupancyMap
+from jaxslam.core.maps import MAX_RESOLUTION, MIN_RESOLUTION, OccupancyMap
 from jaxslam.evaluation import map_metrics
-from jaxslam.io import graphml, ros_map
+from jaxslam.io import graphml, pictures, ros_map
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.mapping import grid_topology
@@ -102,7 +102,7 @@ def map_occupancy(
 
 def _read(map_file: Path, resolution: float | None) -> OccupancyMap:
     """The map of a YAML file or of a picture; errors name the option --resolution."""
-    picture = ros_map.is_picture(map_file)
+    picture = pictures.is_picture(map_file)
     if picture and resolution is None:
         advice = "add --resolution METRES, the side of a cell, or name the YAML file of the map"
         raise InputError("is a picture, which has no resolution", path=map_file, advice=advice)
@@ -111,7 +111,7 @@ def _read(map_file: Path, resolution: float | None) -> OccupancyMap:
     if not picture:
         advice = f"leave it out: {map_file} has its own resolution"
         raise InputError("is for a picture alone", field="--resolution", advice=advice)
-    check_range("--resolution", resolution, 0.001, 100.0)
+    check_range("--resolution", resolution, MIN_RESOLUTION, MAX_RESOLUTION)
     return ros_map.read_picture(map_file, resolution)
 
 

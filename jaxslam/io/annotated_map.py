@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxslam.core.maps import MAX_COORDINATE
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
 from jaxslam.io.geojson import COUNTERS, KINDS
 from jaxslam.io.nav2_metadata import users_metadata, users_operations
 
 MAX_ID = 2**31 - 2  # ids are int32, also the one after it
-MAX_COORDINATE = 1e9  # [m]
 
 LINES = ("LineString", "MultiLineString")
 GRAPH_TYPES = ("Point", *LINES)
@@ -278,7 +278,7 @@ def position(geometry: Mapping[str, Any]) -> tuple[float, float]:
         x, y = (float(value) for value in geometry["coordinates"][:2])
     except (TypeError, ValueError, KeyError, OverflowError):
         return math.nan, math.nan
-    return (x, y) if max(abs(x), abs(y)) < MAX_COORDINATE else (math.nan, math.nan)
+    return (x, y) if max(abs(x), abs(y)) <= MAX_COORDINATE else (math.nan, math.nan)
 
 
 def line_points(geometry: Mapping[str, Any]) -> np.ndarray | None:
@@ -295,8 +295,8 @@ def line_points(geometry: Mapping[str, Any]) -> np.ndarray | None:
         line = np.array([[float(p[0]), float(p[1])] for line in lines for p in line])
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):
         line = np.zeros(0)
-    if len(line) < 2 or not (np.abs(line) < MAX_COORDINATE).all():
-        raise ValueError("are no points of a line")
+    if len(line) < 2 or not (np.abs(line) <= MAX_COORDINATE).all():
+        raise ValueError(f"are no points of a line, within {MAX_COORDINATE:g} m of 0, 0")
     return line
 
 

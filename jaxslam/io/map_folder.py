@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.maps import MAX_COORDINATE, OccupancyMap, TopologicalMap
 from jaxslam.core.regions import Regions
 from jaxslam.core.types import CORNER, JUNCTION
 from jaxslam.io import annotated_map, rooms_file, ros_map
@@ -80,8 +80,9 @@ def read_map_folder(path: str | PathLike) -> MapFolder:
     nodes = [*known.nodes, *_users_nodes(known)]
     for node in nodes:
         if not np.isfinite(node.xy).all():
-            advice, field = "give it two coordinates", f"node {node.id}"
-            raise InputError("has no position", path=folder / GRAPH, field=field, advice=advice)
+            problem = f"has no position within {MAX_COORDINATE:g} m of 0, 0"
+            advice, field = "give it two coordinates [m]", f"node {node.id}"
+            raise InputError(problem, path=folder / GRAPH, field=field, advice=advice)
     index = {node.id: n for n, node in enumerate(nodes)}
     roads = [*_roads(known), *_users_roads(known, folder / GRAPH)]
     joined = [r for r in roads if r.edge.start in index and r.edge.end in index]

@@ -8,7 +8,7 @@ from jaxslam.core.regions import Door, PlannerData, Regions
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.mapping.clearance import clearance_at, clearance_field
 
-SPACING = 0.05  # [m] between the places of an arc that are looked at, at most
+SPACING = 0.05  # [m] between the places of an arc that are looked at, or half a cell if larger
 DOOR_MARGIN = 0.1  # [m] by which a door's line is longer than its jambs are apart, at either end
 
 
@@ -27,7 +27,8 @@ def planner_data(
     """
     check_types(graph, occupancy, regions)
     lines = graph.arc_lines
-    places = [polylines.resample(line, 2 + int(polylines.length(line) / SPACING)) for line in lines]
+    spacing = max(SPACING, 0.5 * occupancy.resolution)
+    places = [polylines.resample(line, 2 + int(polylines.length(line) / spacing)) for line in lines]
     widths = clearance_at(clearance_field(occupancy), np.concatenate([np.zeros((0, 2)), *places]))
     last = np.cumsum([len(along) for along in places], dtype=int)
     node_region, arc_region = np.full(len(graph.xy), -1), np.full(len(lines), -1)

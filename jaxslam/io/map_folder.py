@@ -22,7 +22,6 @@ from jaxslam.io.annotated_map import (
     whole,
 )
 from jaxslam.io.errors import InputError
-from jaxslam.io.geojson import KINDS
 
 GRAPH, OCCUPANCY, ROOMS = "map.geojson", "map.yaml", "rooms.json"
 USERS = -1  # id of the arcs of a user
@@ -74,7 +73,8 @@ def read_map_folder(path: str | PathLike) -> MapFolder:
     if not folder.is_dir():
         problem = "is no folder" if folder.exists() else "does not exist"
         raise InputError(problem, path=folder, advice=advice)
-    known = annotated_map.read(folder / GRAPH, sorted({*KINDS, "frontier"}))
+    again = "correct it, or make the map anew with `jaxslam run` or `jaxslam map`"
+    known = annotated_map.read(folder / GRAPH, advice=again)
     if known is None:
         raise InputError(f"holds no {GRAPH}", path=folder, advice=advice)
     nodes = [*known.nodes, *_users_nodes(known)]

@@ -1,15 +1,18 @@
 """The command line: `jaxslam simulate`, `run`, `localise`, `map`, `route` and `tune`."""
 
+import contextlib
+import functools
 import inspect
+import io
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import tyro
 
 import jaxslam
-from jaxslam.cli import deprecated
+from jaxslam.cli import deprecated, usage
 from jaxslam.cli.localise_command import localise_in_map
 from jaxslam.cli.map_command import map_occupancy
 from jaxslam.cli.route_command import plan_route
@@ -32,7 +35,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code: 2 for bad input, 130 for Ctrl-C.
+    """Run the command line and return its exit code: 2 for bad input or usage, 130 for Ctrl-C.
 
     `run --strict` returns 3 if the map contradicts itself.
 
@@ -40,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
         argv: Arguments; by default those of the process, and `--help` if there are none.
 
     Raises:
-        SystemExit: Of code 0 after `--help`, of code 2 after wrong usage.
+        SystemExit: Of code 0, after `--help`.
     """
     argv = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if argv[0] == "--version":
@@ -49,11 +52,10 @@ def main(argv: list[str] | None = None) -> int:
     command, *options = deprecated.rewrite(argv)
     try:
         if command in COMMANDS:
-            function = COMMANDS[command]
-            function.__doc__ = _unwrapped(function.__doc__ or "")
-            return tyro.cli(function, prog=f"jaxslam {command}", args=options) or 0
-        else:
-            _usage(argv)
+            return _parsed(command, options)() or 0
+        if command not in ("--help", "-h"):
+            raise usage.unknown_command(command, list(COMMANDS))
+        _help()
     except InputError as error:
         print(f"jaxslam: error: {error}", file=sys.stderr)
         return 2
@@ -63,8 +65,30 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _usage(argv: list[str]) -> None:
-    """Exit by `--help`, or by what is wrong: the arguments begin with no command."""
+def _parsed(command: str, options: Sequence[str]) -> Callable[[], int | None]:
+    """A command with its options; raise InputError if they are wrong."""
+    function = COMMANDS[command]
+
+    @functools.wraps(function)
+    def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
+        return functools.partial(function, *args, **kwargs)
+
+    bind.__doc__ = _unwrapped(function.__doc__ or "")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            call: Callable[[], int | None] = tyro.cli(
+                bind, prog=f"jaxslam {command}", args=options
+            )
+            return call
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    raise usage.explain(command, function, options, said.getvalue())
+
+
+def _help() -> None:
+    """Print the help of all commands and exit."""
 
     def summary(function: Callable[..., Any]) -> Callable[[], None]:
         def stub() -> None: ...
@@ -75,7 +99,9 @@ def _usage(argv: list[str]) -> None:
     commands: dict[str, Callable[..., Any]] = {
         name: summary(function) for name, function in COMMANDS.items()
     }
-    tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
+    tyro.extras.subcommand_cli_from_dict(
+        commands, prog="jaxslam", description=ABOUT, args=["--help"]
+    )
 
 
 def _unwrapped(docstring: str) -> str:

@@ -91,8 +91,8 @@ def read_picture(path: str | PathLike, resolution: float) -> OccupancyMap:
     """Read a map from a picture alone: white is free, black occupied.
 
     The thresholds are those that map_saver writes; the lower left corner is the origin. Where no
-    shade is dark enough for walls, the darker ones of two groups are, and a note says so; map_saver's
-    shade for unknown is, if there is no other.
+    shade is dark enough for walls, the darker of two groups of shades is, and a note says so; among
+    these is map_saver's shade for unknown only where there is no other.
 
     Args:
         path: Image of one of `pictures.FORMATS`.
@@ -117,7 +117,11 @@ def files_of(path: str | PathLike) -> tuple[Path, ...]:
         InputError: The YAML file cannot be read, or names no image that it may name.
     """
     path = Path(path)
-    return (path,) if pictures.is_picture(path) else (path, _image_path(path, _load(path).get("image"))[0])
+    return (
+        (path,)
+        if pictures.is_picture(path)
+        else (path, _image_path(path, _load(path).get("image"))[0])
+    )
 
 
 def _check_resolution(resolution: float, path: Path | None) -> None:
@@ -135,7 +139,9 @@ def _check_coordinates(found: OccupancyMap, path: str | PathLike, field: str | N
     numbers = np.abs([*transform(found.origin, corners).ravel(), found.origin[2]])
     if not numbers.max() <= MAX_COORDINATE:
         problem = f"the map has coordinates of {numbers.max():g}, beyond {MAX_COORDINATE:g}"
-        raise InputError(problem, path=path, field=field, advice="give it in metres, nearer to 0, 0")
+        raise InputError(
+            problem, path=path, field=field, advice="give it in metres, nearer to 0, 0"
+        )
 
 
 def _of_plan(

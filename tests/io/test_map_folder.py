@@ -152,7 +152,9 @@ def test_what_is_no_map_is_refused(folder):
         read_map_folder(folder)
     (folder / "rooms.json").unlink()
     assert read_map_folder(folder).regions is None
-    with pytest.raises(InputError, match=r"map.geojson: node 3: has no position within 1e\+07 m of 0, 0; give"):
+    with pytest.raises(
+        InputError, match=r"map.geojson: node 3: has no position within 1e\+07 m of 0, 0; give"
+    ):
         edit(folder, lambda features: features[0]["geometry"].update(coordinates=["a", 1]))
     geojson.write(folder / "map.geojson", NODES, ARCS)
     with pytest.raises(InputError, match=r"map.geojson: line 99: are no points of a line"):

@@ -77,9 +77,7 @@ def _parsed(command: str, options: Sequence[str]) -> Callable[[], int | None]:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            call: Callable[[], int | None] = tyro.cli(
-                bind, prog=f"jaxslam {command}", args=options
-            )
+            call: Callable[[], int | None] = tyro.cli(bind, prog=f"jaxslam {command}", args=options)
             return call
     except SystemExit as stop:
         if not stop.code:

@@ -9,7 +9,7 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, room_results, summaries
-from jaxslam.cli.options import OutFolder, check_range, name_errors
+from jaxslam.cli.options import OutFolder, check_range, name_errors, require_other_folder
 from jaxslam.core.maps import MAX_RESOLUTION, MIN_RESOLUTION, OccupancyMap
 from jaxslam.evaluation import map_metrics
 from jaxslam.io import graphml, pictures, ros_map
@@ -49,6 +49,8 @@ def map_occupancy(
     """
     check_range("--robot-radius", robot_radius, 0.01, 100.0)
     check_range("--min-obstacle-size", min_obstacle_size, 0.0, 100.0)
+    if (out / "map.npz").exists():  # of `jaxslam run`, with more than is written here
+        require_other_folder(out, map_file)
     graphml.require()
     grid = _read(map_file, resolution)
     earlier, notes = room_results.earlier_rooms(out)
@@ -87,7 +89,7 @@ def map_occupancy(
         show_progress("writing")
         numbers = map_metrics.map_metrics(result)
         numbers |= {"rooms": len(rooms.regions), "doors": len(rooms.doors)}
-        numbers |= {"clearance_m": robot_radius, "seconds": seconds}
+        numbers |= {"robot_radius_m": robot_radius, "seconds": seconds}
         write_json(out_dir / "metrics.json", numbers)
         data = planner_data(result.graph, grid, rooms)
         report.write_map(out_dir / "map.geojson", result.graph, regions=rooms, planner=data)
@@ -96,6 +98,9 @@ def map_occupancy(
         report.write_exports(out_dir, result.graph, rooms, data)
         report.draw_map(out_dir / "map.png", grid, result.graph, rooms)
         bar.update()
+    note = room_results.without_arcs(rooms, result.graph, data)
+    if note:
+        print(f"note: {note}")
     title = f"{map_file}: robot radius {robot_radius:g} m, regions {result.num_regions}"
     summaries.print_map_summary(numbers, title, out)
 

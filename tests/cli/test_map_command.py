@@ -51,7 +51,7 @@ def test_map_counts_what_it_found(done):
     expected = {"nodes": 2, "arcs": 2, "dead_ends": 1, "rings": 1, "regions": 1}
     assert expected.items() <= numbers.items()
     assert numbers["length_m"] == pytest.approx(2 * 4.9 + 2 * 4.4 + 2.5 - 1.0, abs=0.5)
-    assert 0.4 < numbers["narrowest_m"] < 0.6 and numbers["clearance_m"] == 0.25
+    assert 0.4 < numbers["narrowest_m"] < 0.6 and numbers["robot_radius_m"] == 0.25
     assert 0.0 < numbers["reached_m2"] < 30.0 and numbers["left_out_m2"] == 0.0
     assert numbers["seconds"]["run"] > 0.0
 

@@ -74,7 +74,7 @@ def test_a_route_is_written_and_printed(floor, rooms, tmp_path, capsys):
     assert [leg["region"] for leg in found["legs"]] == ["room_1", "room_2"]
     assert found["legs"][0]["door_width_m"] == 0.8 and found["legs"][1]["door_width_m"] is None
     assert 0.2 < found["narrowest_m"] <= 0.4 and numbers["doors"] == 1
-    assert numbers["clearance_m"] == found["robot_radius_m"] == 0.25
+    assert numbers["robot_radius_m"] == found["robot_radius_m"] == 0.25
 
 
 def test_the_picture_has_its_size_and_shows_the_route(floor, rooms, tmp_path):

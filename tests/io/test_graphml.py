@@ -53,7 +53,8 @@ def test_networkx_reads_regions_doors_and_widths(tmp_path):
     found = networkx.read_graphml(tmp_path / "map.graphml", force_multigraph=True)
     nodes = {name: (data.get("region"), data.get("class")) for name, data in found.nodes.items()}
     corridor, room = ("room_2", "corridor"), ("room_1", "room")
-    assert nodes == {"5": corridor, "7": (None, None), "8": corridor, "11": room}
+    none = (None, None)
+    assert nodes == {"5": corridor, "7": none, "8": corridor, "11": room, "30": none}
     arcs = {data["arc"]: data for *_, data in found.edges(data=True)}
     assert (arcs[0]["region"], arcs[0]["class"]) == ("room_2", "door")
     assert arcs[0]["door"] == "door_3,door_4" and "door" not in arcs[1]
@@ -98,6 +99,9 @@ def test_igraph_reads_all_nodes_and_arcs_by_their_names(tmp_path):
         arc_length=rng.uniform(size=len(ends)),
         arc_clearance=rng.uniform(size=len(ends)),
         arc_lines=tuple(rng.normal(size=(len(ends), 3, 2))),
+        frontiers=(),
+        frontier_node=np.zeros(0, int),
+        frontier_id=np.zeros(0, int),
     )
     graphml.write(tmp_path / "map.graphml", graph)
     found = igraph.Graph.Read_GraphML(str(tmp_path / "map.graphml"))

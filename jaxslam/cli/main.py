@@ -68,12 +68,12 @@ def main(argv: list[str] | None = None) -> int:
 def _parsed(command: str, options: Sequence[str]) -> Callable[[], int | None]:
     """A command with its options; raise InputError if they are wrong."""
     function = COMMANDS[command]
+    function.__doc__ = _unwrapped(function.__doc__ or "")
 
     @functools.wraps(function)
     def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
         return functools.partial(function, *args, **kwargs)
 
-    bind.__doc__ = _unwrapped(function.__doc__ or "")
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

@@ -39,8 +39,8 @@ def write(
     A node has `name`, its id, `kind`, `x`, `y` and `clearance`, an edge its number `arc`, the names
     `start` and `end` of its nodes, `length` and `clearance`, all [m], and `line`, the polyline in
     well-known text from `start` to `end`. Both have their `region` and `class`, an edge its `door`,
-    `speed_limit` [%], `filled`, as in map.geojson, and `widths`, the clearances [m] evenly
-    along `line`, with commas. Values that are not finite, or empty, are left out; of `widths` they are
+    `speed_limit` [%], `filled`, as in map.geojson, and `widths`, the clearances [m] evenly along
+    `line`, with commas. Values that are not finite, or empty, are left out; of `widths` they are
     `nan`. Open ends that have ids are nodes of kind `frontier`, with the edges to them.
 
     Args:

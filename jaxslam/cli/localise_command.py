@@ -9,7 +9,13 @@ from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
 from jaxslam.cli.log_options import Scanner, ScannerOptions, require_beams, require_odometry
-from jaxslam.cli.options import OptionalFile, OptionalTopic, OutFolder, name_errors
+from jaxslam.cli.options import (
+    OptionalFile,
+    OptionalTopic,
+    OutFolder,
+    name_errors,
+    require_other_folder,
+)
 from jaxslam.cli.stopwatch import stopwatch
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
@@ -45,7 +51,7 @@ def localise_in_map(
     scan_topic: OptionalTopic = None,
     odometry_topic: OptionalTopic = None,
     scanner: Scanner = ScannerOptions(),  # noqa: B008
-    out: OutFolder = Path("out"),
+    out: OutFolder = Path("localised"),
 ) -> int:
     """Find a robot in a saved map, and track it there.
 
@@ -65,8 +71,9 @@ def localise_in_map(
         odometry_topic: Topic of the odometry or of the transforms in a bag; by default the one
             with most messages.
         scanner: The scanner and the frames of the log.
-        out: Folder for the results.
+        out: Folder for the results, not that of the map.
     """
+    require_other_folder(out, map)
     saved_map = map_file.load_map(map)
     laser_log = scanner.read_log(log, scan_topic=scan_topic, odometry_topic=odometry_topic)
     require_beams(log, laser_log)

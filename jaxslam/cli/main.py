@@ -1,16 +1,19 @@
 """The command line: `jaxslam simulate`, `run`, `localise`, `map`, `route` and `tune`."""
 
+import contextlib
+import functools
 import inspect
+import io
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
 import tyro
 
 import jaxslam
-from jaxslam.cli import deprecated
+from jaxslam.cli import deprecated, usage
 from jaxslam.io.errors import InputError
 
 ABOUT = """Topological SLAM for a robot with a 2-D laser scanner.
@@ -28,7 +31,7 @@ COMMANDS = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return its exit code: 2 for bad input, 130 for Ctrl-C.
+    """Run the command line and return its exit code: 2 for bad input or usage, 130 for Ctrl-C.
 
     `run --strict` returns 3 if the map contradicts itself.
 
@@ -36,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
         argv: Arguments; by default those of the process, and `--help` if there are none.
 
     Raises:
-        SystemExit: Of code 0 after `--help`, of code 2 after wrong usage.
+        SystemExit: Of code 0, after `--help`.
     """
     argv = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if argv[0] == "--version":
@@ -45,11 +48,10 @@ def main(argv: list[str] | None = None) -> int:
     command, *options = deprecated.rewrite(argv)
     try:
         if command in COMMANDS:
-            function = function_of(command)
-            function.__doc__ = _unwrapped(function.__doc__ or "")
-            return tyro.cli(function, prog=f"jaxslam {command}", args=options) or 0
-        else:
-            _usage(argv)
+            return _parsed(command, options)() or 0
+        if command not in ("--help", "-h"):
+            raise usage.unknown_command(command, list(COMMANDS))
+        _help()
     except InputError as error:
         print(f"jaxslam: error: {error}", file=sys.stderr)
         return 2
@@ -66,8 +68,28 @@ def function_of(command: str) -> Callable[..., Any]:
     return function
 
 
-def _usage(argv: list[str]) -> None:
-    """Exit by `--help`, or by what is wrong: the arguments begin with no command."""
+def _parsed(command: str, options: Sequence[str]) -> Callable[[], int | None]:
+    """A command with its options; raise InputError if they are wrong."""
+    function = function_of(command)
+    function.__doc__ = _unwrapped(function.__doc__ or "")
+
+    @functools.wraps(function)
+    def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
+        return functools.partial(function, *args, **kwargs)
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            call: Callable[[], int | None] = tyro.cli(bind, prog=f"jaxslam {command}", args=options)
+            return call
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    raise usage.explain(command, function, options, said.getvalue())
+
+
+def _help() -> None:
+    """Print the help of all commands and exit."""
 
     def summary(function: Callable[..., Any]) -> Callable[[], None]:
         def stub() -> None: ...
@@ -76,7 +98,9 @@ def _usage(argv: list[str]) -> None:
         return stub
 
     commands = {command: summary(function_of(command)) for command in COMMANDS}
-    tyro.extras.subcommand_cli_from_dict(commands, prog="jaxslam", description=ABOUT, args=argv)
+    tyro.extras.subcommand_cli_from_dict(
+        commands, prog="jaxslam", description=ABOUT, args=["--help"]
+    )
 
 
 def _unwrapped(docstring: str) -> str:

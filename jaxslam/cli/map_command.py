@@ -9,10 +9,10 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import map_files, room_results, summaries
-from jaxslam.cli.options import OutFolder, check_range, name_errors
-from jaxslam.core.maps import OccupancyMap
+from jaxslam.cli.options import OutFolder, check_range, name_errors, require_other_folder
+from jaxslam.core.maps import MAX_RESOLUTION, MIN_RESOLUTION, OccupancyMap
 from jaxslam.evaluation import map_metrics
-from jaxslam.io import geojson, graphml, ros_map
+from jaxslam.io import geojson, graphml, pictures, ros_map
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.io.route_graph import route_graph
@@ -51,6 +51,8 @@ def map_occupancy(
     """
     check_range("--robot-radius", robot_radius, 0.01, 100.0)
     check_range("--min-obstacle-size", min_obstacle_size, 0.0, 100.0)
+    if (out / "map.npz").exists():  # of `jaxslam run`, with more than is written here
+        require_other_folder(out, map_file)
     graphml.require()
     grid = _read(map_file, resolution)
     earlier, notes = room_results.earlier_rooms(out)
@@ -89,7 +91,7 @@ def map_occupancy(
         show_progress("writing")
         numbers = map_metrics.map_metrics(result)
         numbers |= {"rooms": len(rooms.regions), "doors": len(rooms.doors)}
-        numbers |= {"clearance_m": robot_radius, "seconds": seconds}
+        numbers |= {"robot_radius_m": robot_radius, "seconds": seconds}
         write_json(out_dir / "metrics.json", numbers)
         data = planner_data(result.graph, grid, rooms)
         geojson.write(out_dir / "map.geojson", *route_graph(result.graph, rooms, data))
@@ -98,13 +100,16 @@ def map_occupancy(
         map_files.write_exports(out_dir, result.graph, rooms, data)
         map_files.draw_map(out_dir / "map.png", grid, result.graph, rooms)
         bar.update()
+    note = room_results.without_arcs(rooms, result.graph, data)
+    if note:
+        print(f"note: {note}")
     title = f"{map_file}: robot radius {robot_radius:g} m, regions {result.num_regions}"
     summaries.print_map_summary(numbers, title, out)
 
 
 def _read(map_file: Path, resolution: float | None) -> OccupancyMap:
     """The map of a YAML file or of a picture; errors name the option --resolution."""
-    picture = ros_map.is_picture(map_file)
+    picture = pictures.is_picture(map_file)
     if picture and resolution is None:
         advice = "add --resolution METRES, the side of a cell, or name the YAML file of the map"
         raise InputError("is a picture, which has no resolution", path=map_file, advice=advice)
@@ -113,7 +118,7 @@ def _read(map_file: Path, resolution: float | None) -> OccupancyMap:
     if not picture:
         advice = f"leave it out: {map_file} has its own resolution"
         raise InputError("is for a picture alone", field="--resolution", advice=advice)
-    check_range("--resolution", resolution, 0.001, 100.0)
+    check_range("--resolution", resolution, MIN_RESOLUTION, MAX_RESOLUTION)
     return ros_map.read_picture(map_file, resolution)
 
 

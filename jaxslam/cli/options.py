@@ -40,6 +40,18 @@ def check_range(option: str, value: float, low: float, high: float) -> None:
         raise InputError(f"{value} is not between {low} and {high}", field=option)
 
 
+def require_other_folder(out: Path, map_folder: Path) -> None:
+    """Raise InputError if the output folder is that of the map that a command reads, or its file.
+
+    Results would replace those of the map.
+    """
+    if map_folder.is_file():
+        map_folder = map_folder.parent
+    if out.exists() and map_folder.exists() and out.samefile(map_folder):
+        problem = f"{out} is the folder of the map, whose results would be replaced"
+        raise InputError(problem, field="--out", advice="name another folder")
+
+
 @contextmanager
 def name_errors(what: str) -> Iterator[None]:
     """Turn a ValueError of the block into an InputError that names the option or file."""

@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from jaxslam.cli import summaries
-from jaxslam.cli.options import OutFolder, check_range
+from jaxslam.cli.options import OutFolder, check_range, require_other_folder
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
 from jaxslam.core.regions import Regions
 from jaxslam.core.types import Metrics
@@ -35,7 +35,7 @@ def plan_route(
         tyro.conf.arg(name="to", metavar="X Y|ROOM", help_behavior_hint="(required)"),
     ],
     robot_radius: float = 0.25,
-    out: OutFolder = Path("out"),
+    out: OutFolder = Path("route"),
 ) -> None:
     """Find the shortest route over a saved map, to a point or a room.
 
@@ -47,14 +47,17 @@ def plan_route(
     Args:
         map: Output folder of `jaxslam run` or `jaxslam map`.
         start: Start [m m] in the map frame.
-        goal: Goal [m m] in the map frame, or the name of a room, as in room_12.
+        goal: Goal [m m] in the map frame, or the name of a room, as in room_12: the route ends on
+            an arc inside, 1 m from its doors if it is that large, also if it begins in the room; in
+            a room without arcs for the robot, in its middle.
         robot_radius: Robot radius [m]: least distance to obstacles, to within a cell.
-        out: Folder for the results.
+        out: Folder for the results, not that of the map.
     """
     check_range("--robot-radius", robot_radius, 0.0, 100.0)
     first = _point("--from", start)
     name = goal[0] if len(goal) == 1 and not _is_number(goal[0].split(",")[0]) else None
     last = _point("--to", goal) if name is None else name
+    require_other_folder(out, map)
     known = read_map_folder(map)
     for note in known.notes:
         print(f"note: {note}", flush=True)
@@ -74,7 +77,7 @@ def plan_route(
     seconds = {"run": perf_counter() - begin}
     where = "the goal" if name is None else name
     legs = describe(planned.legs, where)
-    numbers = _metrics(planned) | {"clearance_m": robot_radius, "seconds": seconds}
+    numbers = _metrics(planned) | {"robot_radius_m": robot_radius, "seconds": seconds}
     with folder(out) as out_dir:
         content = _content(planned, known, legs) | {"goal_region": name}
         write_json(out_dir / "route.json", content | {"robot_radius_m": robot_radius})

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 MAX_CELLS = 2**26  # most cells of a map
+MIN_RESOLUTION, MAX_RESOLUTION = 0.001, 100.0  # [m] of a map in a file
+MAX_COORDINATE = 1e7  # [m] of any point of a map in a file
 
 
 class OccupancyMap(NamedTuple):

@@ -9,19 +9,19 @@ or 12.0, nested objects as strings of JSON, missing values as null, and ids as m
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxslam.core.maps import MAX_COORDINATE
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
 from jaxslam.io.geojson import COUNTERS, KINDS
 from jaxslam.io.nav2_metadata import users_metadata, users_operations
 
 MAX_ID = 2**31 - 2  # ids are int32, also the one after it
-MAX_COORDINATE = 1e9  # [m]
 
 LINES = ("LineString", "MultiLineString")
 GRAPH_TYPES = ("Point", *LINES)
@@ -102,12 +102,12 @@ class AnnotatedMap(NamedTuple):
     next_arc: int
 
 
-def read(path: str | PathLike, kinds: Collection[str] = KINDS) -> AnnotatedMap | None:
+def read(path: str | PathLike, advice: str = _AGAIN) -> AnnotatedMap | None:
     """Read a map that `geojson.write` wrote and a user may have edited.
 
     Args:
         path: The file.
-        kinds: Kinds of our nodes; a Point of another kind is the user's.
+        advice: What to do with a file that is refused.
 
     Returns:
         The map, or None if there is no such file.
@@ -115,25 +115,26 @@ def read(path: str | PathLike, kinds: Collection[str] = KINDS) -> AnnotatedMap |
     Raises:
         InputError: The file cannot be read, is too large, too deeply nested or no JSON as RFC 8259
             has it, NaN and repeated keys included; is no FeatureCollection; or a feature of ours
-            has no id or ends, two features have the same id, or properties are no object.
+            has no id or ends, two features have the same id, two edges of an arc are not its two
+            directions, or properties are no object.
     """
-    content = strict_json.read(path, _AGAIN)
+    content = strict_json.read(path, advice)
     if content is None:
         return None
     if not isinstance(content, dict) or content.get("type") != "FeatureCollection":
-        raise InputError("is no FeatureCollection", path=path, field="type", advice=_AGAIN)
+        raise InputError("is no FeatureCollection", path=path, field="type", advice=advice)
     if not isinstance(content.get("features"), list):
-        raise InputError("missing or no array", path=path, field="features", advice=_AGAIN)
+        raise InputError("missing or no array", path=path, field="features", advice=advice)
     nodes: list[OldNode] = []
     edges: dict[int, list[OldEdge]] = {}
     own: list[Mapping[str, Any]] = []
     ids: dict[int, int] = {}
     for number, feature in enumerate(content["features"]):
-        where = _Place(path, number)
+        where = _Place(path, number, advice)
         geometry, properties = _checked(where, feature)
         metadata = _as_object(properties.get("metadata"))
         node_id: int | None = None
-        if geometry.get("type") == "Point" and metadata.get("kind") in list(kinds):
+        if geometry.get("type") == "Point" and metadata.get("kind") in KINDS:
             node_id = _id(where, feature, properties)
             own_properties = _of_user(properties, NODE_KEYS, NODE_METADATA)
             xy, clearance = position(geometry), _length(metadata.get("clearance"))
@@ -142,7 +143,7 @@ def read(path: str | PathLike, kinds: Collection[str] = KINDS) -> AnnotatedMap |
             node_id = _id(where, feature, properties)
             arc = _number(where, "properties.metadata.arc", metadata["arc"])
             edge = _edge(where, node_id, geometry, properties, metadata)
-            _add_edge(where, edges.setdefault(arc, []), arc, edge)
+            edges.setdefault(arc, []).append(edge)
         else:
             own.append(feature)
             if geometry.get("type") in GRAPH_TYPES:
@@ -150,6 +151,7 @@ def read(path: str | PathLike, kinds: Collection[str] = KINDS) -> AnnotatedMap |
         if node_id is not None and ids.setdefault(node_id, number) != number:
             problem = f"{node_id} is also that of features[{ids[node_id]}]"
             raise where.error("properties.id", problem, "give each feature an id of its own")
+    _check_arcs(path, edges, ids)
     if not nodes and any(_looks_like_a_node(feature) for feature in own):
         advice = "an editor dropped it: take the file as it was before"
         raise InputError("no Point has metadata.kind", path=path, field="features", advice=advice)
@@ -179,11 +181,12 @@ class _Place(NamedTuple):
 
     path: str | PathLike
     number: int
+    advice: str = _AGAIN
 
-    def error(self, field: str, problem: str, advice: str = _AGAIN) -> InputError:
+    def error(self, field: str, problem: str, advice: str | None = None) -> InputError:
         """Error in a field of the feature; the field may be empty."""
         name = f"features[{self.number}]" + (f".{field}" if field else "")
-        return InputError(problem, path=self.path, field=name, advice=advice)
+        return InputError(problem, path=self.path, field=name, advice=advice or self.advice)
 
 
 def _checked(where: _Place, feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
@@ -278,7 +281,7 @@ def position(geometry: Mapping[str, Any]) -> tuple[float, float]:
         x, y = (float(value) for value in geometry["coordinates"][:2])
     except (TypeError, ValueError, KeyError, OverflowError):
         return math.nan, math.nan
-    return (x, y) if max(abs(x), abs(y)) < MAX_COORDINATE else (math.nan, math.nan)
+    return (x, y) if max(abs(x), abs(y)) <= MAX_COORDINATE else (math.nan, math.nan)
 
 
 def line_points(geometry: Mapping[str, Any]) -> np.ndarray | None:
@@ -295,18 +298,35 @@ def line_points(geometry: Mapping[str, Any]) -> np.ndarray | None:
         line = np.array([[float(p[0]), float(p[1])] for line in lines for p in line])
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):
         line = np.zeros(0)
-    if len(line) < 2 or not (np.abs(line) < MAX_COORDINATE).all():
-        raise ValueError("are no points of a line")
+    if len(line) < 2 or not (np.abs(line) <= MAX_COORDINATE).all():
+        raise ValueError(f"are no points of a line, within {MAX_COORDINATE:g} m of 0, 0")
     return line
 
 
-def _add_edge(where: _Place, edges: list[OldEdge], arc: int, edge: OldEdge) -> None:
-    """Add a direction of an arc to those before it."""
-    if len(edges) > 1 or any((edge.start, edge.end) != (e.end, e.start) for e in edges):
-        advice = "remove metadata.arc from edges of your own"
-        problem = f"{arc} is that of an edge before, which is not its other direction"
-        raise where.error("properties.metadata.arc", problem, advice)
-    edges.append(edge)
+def _check_arcs(
+    path: str | PathLike, arcs: Mapping[int, Sequence[OldEdge]], ids: Mapping[int, int]
+) -> None:
+    """Raise InputError unless each arc has one edge, or one in each direction.
+
+    Args:
+        path: The file.
+        arcs: The edges of each arc.
+        ids: Number of the feature of each id.
+    """
+    others = ids.keys() - {edge.id for edges in arcs.values() for edge in edges}
+    for arc, (first, *more) in arcs.items():
+        if not more or len(more) == 1 and (first.end, first.start) == (more[0].start, more[0].end):
+            continue
+        for edge in (first, *more):
+            for field, end in (("startid", edge.start), ("endid", edge.end)):
+                if end not in others:
+                    advice = "write that of the node where the edge begins or ends"
+                    where = _Place(path, ids[edge.id])
+                    raise where.error(f"properties.{field}", f"{end} is the id of no node", advice)
+        before = " and ".join(f"features[{ids[edge.id]}]" for edge in (first, *more[:-1]))
+        problem = f"{arc} is also that of {before}, and an arc has one edge there and one back"
+        advice = "remove metadata.arc from edges of your own, or correct startid and endid"
+        raise _Place(path, ids[more[-1].id]).error("properties.metadata.arc", problem, advice)
 
 
 def _looks_like_a_node(feature: Mapping[str, Any]) -> bool:

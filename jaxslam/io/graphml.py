@@ -17,9 +17,8 @@ from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.types import as_float64
 from jaxslam.io.errors import InputError
-from jaxslam.io.nav2_metadata import node_metadata
 from jaxslam.io.output import write_text
-from jaxslam.io.route_labels import arc_clearances, labels
+from jaxslam.io.route_graph import route_graph
 
 
 def require() -> None:
@@ -37,11 +36,12 @@ def write(
 ) -> None:
     """Write a map as an undirected multigraph.
 
-    A node has `name`, its id, `x`, `y` and `clearance`, an edge its number `arc`, the names `start`
-    and `end` of its nodes, `length` and `clearance`, all [m], and `line`, the polyline in
-    well-known text from `start` to `end`. Both have their `region` and `class`, an edge its `door`
-    and `widths`, the clearances [m] at the points of `line`, with commas. Values that are not
-    finite, or empty, are left out; of `widths` they are `nan`.
+    A node has `name`, its id, `kind`, `x`, `y` and `clearance`, an edge its number `arc`, the names
+    `start` and `end` of its nodes, `length` and `clearance`, all [m], and `line`, the polyline in
+    well-known text from `start` to `end`. Both have their `region` and `class`, an edge its `door`,
+    `speed_limit` [%], `filled`, as in map.geojson, and `widths`, the clearances [m] evenly along
+    `line`, with commas. Values that are not finite, or empty, are left out; of `widths` they are
+    `nan`. Open ends that have ids are nodes of kind `frontier`, with the edges to them.
 
     Args:
         path: File to write, atomically.
@@ -58,25 +58,19 @@ def write(
     import networkx
 
     graph = _checked(graph)
-    of_nodes, of_arcs = labels(graph, regions, planner)
-    clearances = arc_clearances(graph, planner)
+    nodes, arcs = route_graph(graph, regions, planner)
     multigraph = networkx.MultiGraph()
-    rows = zip(graph.id, graph.xy, graph.clearance, of_nodes, strict=True)
-    for node, (x, y), clearance, label in rows:
-        attributes: dict[str, Any] = {"name": str(node), "x": float(x), "y": float(y)}
-        attributes |= _finite({"clearance": clearance}) | node_metadata(label)
-        multigraph.add_nodes_from([(int(node), attributes)])
-    for index, (start, end) in enumerate(graph.arc_ends):
-        numbers = {"length": graph.arc_length[index], "clearance": clearances[index]}
-        source, target = int(graph.id[start]), int(graph.id[end])
-        attributes = {"arc": index, "start": str(source), "end": str(target)}
-        attributes |= {"line": _well_known_text(graph.arc_lines[index])}
-        attributes |= _finite(numbers) | node_metadata(of_arcs[index])
-        if of_arcs[index].doors:
-            attributes["door"] = ",".join(of_arcs[index].doors)
-        if planner is not None:
-            attributes["widths"] = ",".join(f"{width:.3f}" for width in planner.arc_widths[index])
-        multigraph.add_edges_from([(source, target, index, attributes)])
+    for node in nodes:
+        attributes: dict[str, Any] = {"name": str(node.id), "kind": node.kind}
+        attributes |= {"x": node.x, "y": node.y} | _finite({"clearance": node.clearance})
+        multigraph.add_nodes_from([(node.id, attributes | dict(node.metadata))])
+    for arc in arcs:
+        attributes = {"arc": arc.id, "start": str(arc.start), "end": str(arc.end)}
+        attributes |= {"line": _well_known_text(np.asarray(arc.points, np.float64))}
+        attributes |= _finite({"length": arc.length, "clearance": arc.clearance})
+        if planner is not None and arc.id < len(planner.arc_widths):
+            attributes["widths"] = ",".join(f"{width:.3f}" for width in planner.arc_widths[arc.id])
+        multigraph.add_edges_from([(arc.start, arc.end, arc.id, attributes | dict(arc.metadata))])
     write_text(path, "\n".join(networkx.generate_graphml(multigraph)) + "\n")
 
 
@@ -92,6 +86,7 @@ def _checked(graph: TopologicalMap) -> TopologicalMap:
     return graph._replace(
         id=as_float64("id", graph.id, (num_nodes,)).astype(int),
         xy=xy,
+        kind=as_float64("kind", graph.kind, (num_nodes,)).astype(int),
         clearance=as_float64("clearance", graph.clearance, (num_nodes,)),
         arc_ends=ends,
         arc_length=as_float64("arc_length", graph.arc_length, (num_arcs,)),

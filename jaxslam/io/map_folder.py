@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.maps import MAX_COORDINATE, OccupancyMap, TopologicalMap
 from jaxslam.core.regions import Regions
 from jaxslam.core.types import CORNER, JUNCTION
 from jaxslam.io import annotated_map, rooms_file, ros_map
@@ -22,7 +22,6 @@ from jaxslam.io.annotated_map import (
     whole,
 )
 from jaxslam.io.errors import InputError
-from jaxslam.io.geojson import KINDS
 
 GRAPH, OCCUPANCY, ROOMS = "map.geojson", "map.yaml", "rooms.json"
 USERS = -1  # id of the arcs of a user
@@ -74,14 +73,16 @@ def read_map_folder(path: str | PathLike) -> MapFolder:
     if not folder.is_dir():
         problem = "is no folder" if folder.exists() else "does not exist"
         raise InputError(problem, path=folder, advice=advice)
-    known = annotated_map.read(folder / GRAPH, sorted({*KINDS, "frontier"}))
+    again = "correct it, or make the map anew with `jaxslam run` or `jaxslam map`"
+    known = annotated_map.read(folder / GRAPH, advice=again)
     if known is None:
         raise InputError(f"holds no {GRAPH}", path=folder, advice=advice)
     nodes = [*known.nodes, *_users_nodes(known)]
     for node in nodes:
         if not np.isfinite(node.xy).all():
-            advice, field = "give it two coordinates", f"node {node.id}"
-            raise InputError("has no position", path=folder / GRAPH, field=field, advice=advice)
+            problem = f"has no position within {MAX_COORDINATE:g} m of 0, 0"
+            advice, field = "give it two coordinates [m]", f"node {node.id}"
+            raise InputError(problem, path=folder / GRAPH, field=field, advice=advice)
     index = {node.id: n for n, node in enumerate(nodes)}
     roads = [*_roads(known), *_users_roads(known, folder / GRAPH)]
     joined = [r for r in roads if r.edge.start in index and r.edge.end in index]

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam.core.maps import MAX_COORDINATE
 from jaxslam.core.regions import REGION_KINDS, Door, Region, Regions
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
@@ -31,8 +32,7 @@ from jaxslam.mapping.region_names import number_of
 
 JSON_NAME, PNG_NAME = "rooms.json", "rooms.png"
 FORMAT, VERSION = "jaxslam-rooms", 1
-MAX_LENGTH = 1e7  # [m] of any coordinate
-_ADVICE = "name a rooms.json written by `jaxslam map`"
+_ADVICE = "correct it, or remove the file to do without its rooms"
 
 
 def write_rooms(folder: str | PathLike, regions: Regions) -> None:
@@ -101,7 +101,8 @@ def read_rooms(path: str | PathLike) -> Regions:
     path = Path(path) / JSON_NAME if Path(path).is_dir() else Path(path)
     content = strict_json.read(path, _ADVICE)
     if content is None:
-        raise InputError("does not exist", path=path, advice=_ADVICE)
+        advice = f"name a {JSON_NAME} written by `jaxslam map`"
+        raise InputError("does not exist", path=path, advice=advice)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"is no {FORMAT} file", path=path, field="format", advice=_ADVICE)
     if content.get("version") != VERSION:
@@ -161,16 +162,21 @@ class _Reader:
         return items
 
     def _numbers(
-        self, item: dict[str, Any], key: str, shape: tuple[int, ...], where: str
+        self,
+        item: dict[str, Any],
+        key: str,
+        shape: tuple[int, ...],
+        where: str,
+        most: float = MAX_COORDINATE,
     ) -> np.ndarray:
-        """Finite numbers as an array of a shape; -1 is any length."""
+        """Finite numbers up to `most` as an array of a shape; -1 is any length."""
         field = f"{where}.{key}".lstrip(".")
 
         def check(value: Any, shape: tuple[int, ...]) -> None:
             if not shape:
                 is_number = isinstance(value, int | float) and not isinstance(value, bool)
-                if not is_number or not abs(value) <= MAX_LENGTH or not math.isfinite(value):
-                    self._refuse(f"missing or no numbers up to {MAX_LENGTH:g}", field)
+                if not is_number or not abs(value) <= most or not math.isfinite(value):
+                    self._refuse(f"missing or no numbers up to {most:g}", field)
                 return
             if not isinstance(value, list) or shape[0] not in (-1, len(value)):
                 self._refuse(f"missing or no list of {shape[0]}".replace(" of -1", ""), field)
@@ -238,7 +244,7 @@ class _Reader:
         polygon = self._ring(item, "polygon", where)
         holes = self._member({"holes": [], **item}, "holes", list, where)
         rings = {f"holes[{k}]": hole for k, hole in enumerate(holes)}
-        area = float(self._numbers(item, "area", (), where))
+        area = float(self._numbers(item, "area", (), where, MAX_COORDINATE**2))
         if area <= 0.0:
             self._refuse("is not positive", f"{where}.area")
         own = self._named(item, "doors", where, door_names)

@@ -1,10 +1,9 @@
 """ROS occupancy grids: a map_server YAML file and its image.
 
-Reading the YAML needs the extra `[ros]`; images are read by Pillow, which matplotlib installs.
+Reading the YAML needs the extra `[ros]`.
 """
 
 import math
-import warnings
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path, PureWindowsPath
@@ -12,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.core.maps import MAX_CELLS, OccupancyMap
+from jaxslam.core.maps import MAX_COORDINATE, MAX_RESOLUTION, MIN_RESOLUTION, OccupancyMap
+from jaxslam.core.se2_np import transform
 from jaxslam.core.types import as_float64, check_array
+from jaxslam.io import pictures
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace, write_text
 from jaxslam.io.text import lines
 
 MAX_YAML_BYTES = 2**16  # [bytes] of the longest YAML file
-FORMATS = ("PPM", "PNG", "BMP")  # PPM stands for all of PBM, PGM and PPM
 MODES = ("trinary", "scale", "raw")
 UNKNOWN_SHADE, FREE_SHADE = 205, 254  # [0, 255] that map_saver writes; 254 and 255 are free
 UNKNOWN_PROBABILITY = 1 - UNKNOWN_SHADE / 255
 THRESHOLDS = (0.196, 0.65)  # free below, occupied above; the shade 205 is just above the first
-PICTURES = tuple(".png .pgm .pbm .ppm .pnm .bmp .jpg .jpeg .gif .tif .tiff".split())
 FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 
@@ -40,8 +39,8 @@ def read(path: str | PathLike) -> OccupancyMap:
 
     Raises:
         InputError: PyYAML is not installed; the file is no YAML or lacks a field; a field is of
-            the wrong type or out of range; the image lies outside the map's folder, cannot be
-            read, or has no cells or more than `MAX_CELLS`.
+            the wrong type or out of range, or the map reaches beyond `MAX_COORDINATE`; the image
+            lies outside the map's folder, cannot be read, or has no cells or more than `MAX_CELLS`.
 
     References:
         https://docs.nav2.org/configuration/packages/configuring-map-server.html
@@ -52,9 +51,7 @@ def read(path: str | PathLike) -> OccupancyMap:
         if name not in fields:
             raise InputError("missing", path=path, field=name, advice="add it")
     resolution = _number(path, "resolution", fields["resolution"])
-    if resolution <= 0.0:
-        problem, advice = f"{resolution} is not positive", "give the side of a cell in metres"
-        raise InputError(problem, path=path, field="resolution", advice=advice)
+    _check_resolution(resolution, path)
     origin = fields["origin"]
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError("is not a list of three numbers", path=path, field="origin")
@@ -75,28 +72,42 @@ def read(path: str | PathLike) -> OccupancyMap:
         problem = f"{free_below} is not below the occupied_thresh of {occupied_above}"
         raise InputError(problem, path=path, field="free_thresh")
     image, notes = _image_path(path, fields["image"])
-    return _to_map(
-        image, resolution, origin, notes, (mode, bool(negate), free_below, occupied_above)
-    )
+    shade, known = pictures.read(image)
+    if mode == "trinary" and not negate and UNKNOWN_PROBABILITY < free_below:
+        is_unknown = _written_as_unknown(shade)
+        if is_unknown.any():
+            known &= ~is_unknown
+            notes.append(
+                f"cells of the shade {UNKNOWN_SHADE}, which map_saver writes for unknown, stay "
+                f"unknown, although the free_thresh of {free_below:g} would make them free"
+            )
+    meaning = (mode, bool(negate), free_below, occupied_above)
+    found = _to_map(shade, known, resolution, origin, notes, meaning)
+    _check_coordinates(found, path, "origin")
+    return found
 
 
 def read_picture(path: str | PathLike, resolution: float) -> OccupancyMap:
     """Read a map from a picture alone: white is free, black occupied.
 
-    The thresholds are those that map_saver writes; the lower left corner is the origin.
+    The thresholds are those that map_saver writes; the lower left corner is the origin. Where no
+    shade is dark enough for walls, the darker of two groups of shades is, and a note says so; among
+    these is map_saver's shade for unknown only where there is no other.
 
     Args:
-        path: PGM, PNG or BMP image.
+        path: Image of one of `pictures.FORMATS`.
         resolution: [m] side of a cell.
 
     Raises:
-        InputError: The picture cannot be read, or has no cells or more than `MAX_CELLS`; or the
-            resolution is not a positive number.
+        InputError: The picture cannot be read, or has no cells or more than `MAX_CELLS`; the
+            resolution is out of range, or the map reaches beyond `MAX_COORDINATE`.
     """
-    if not 0.0 < resolution < math.inf:
-        problem, advice = f"{resolution} is not positive", "give the side of a cell in metres"
-        raise InputError(problem, field="resolution", advice=advice)
-    return _to_map(Path(path), resolution, np.zeros(3), [], ("trinary", False, *THRESHOLDS))
+    _check_resolution(resolution, None)
+    shade, known = pictures.read(Path(path))
+    known, limits, notes = _of_plan(shade, known)
+    found = _to_map(shade, known, resolution, np.zeros(3), notes, ("trinary", False, *limits))
+    _check_coordinates(found, path, None)
+    return found
 
 
 def files_of(path: str | PathLike) -> tuple[Path, ...]:
@@ -106,16 +117,56 @@ def files_of(path: str | PathLike) -> tuple[Path, ...]:
         InputError: The YAML file cannot be read, or names no image that it may name.
     """
     path = Path(path)
-    return (path,) if is_picture(path) else (path, _image_path(path, _load(path).get("image"))[0])
+    return (
+        (path,)
+        if pictures.is_picture(path)
+        else (path, _image_path(path, _load(path).get("image"))[0])
+    )
 
 
-def is_picture(path: str | PathLike) -> bool:
-    """Whether a path has the name of a picture, not of a YAML file."""
-    return Path(path).suffix.lower() in PICTURES
+def _check_resolution(resolution: float, path: Path | None) -> None:
+    """Raise InputError if the side of a cell [m] is out of range."""
+    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        problem = f"{resolution:g} is not between {MIN_RESOLUTION:g} and {MAX_RESOLUTION:g}"
+        advice = "give the side of a cell in metres"
+        raise InputError(problem, path=path, field="resolution", advice=advice)
+
+
+def _check_coordinates(found: OccupancyMap, path: str | PathLike, field: str | None) -> None:
+    """Raise InputError if a map reaches beyond `MAX_COORDINATE`."""
+    rows, columns = found.free.shape
+    corners = np.array([[0, 0], [rows, 0], [0, columns], [rows, columns]]) * found.resolution
+    numbers = np.abs([*transform(found.origin, corners).ravel(), found.origin[2]])
+    if not numbers.max() <= MAX_COORDINATE:
+        problem = f"the map has coordinates of {numbers.max():g}, beyond {MAX_COORDINATE:g}"
+        raise InputError(
+            problem, path=path, field=field, advice="give it in metres, nearer to 0, 0"
+        )
+
+
+def _of_plan(
+    shade: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, tuple[float, float], list[str]]:
+    """Which pixels (H, W) of a picture alone are known, free_thresh and occupied_thresh, notes."""
+    free_below, occupied_above = THRESHOLDS
+    occupied = known & (1.0 - shade > occupied_above)
+    free = known & (1.0 - shade < free_below)
+    dark = known & ~free
+    if occupied.any() or not free.any() or not dark.any():
+        return known, THRESHOLDS, []
+    unknown = dark & (np.round(255.0 * shade) == UNKNOWN_SHADE)
+    if (dark & ~unknown).any():
+        known = known & ~unknown
+    limit = pictures.wall_shade(shade[known])
+    assert limit is not None  # there are two levels
+    darkest = round(255 * float(shade[known].min()))
+    note = f"the darkest shade is {darkest} of 255, so that all below {255 * limit:.0f} are walls"
+    return known, (1.0 - limit, 1.0 - limit), [note]
 
 
 def _to_map(
-    image: Path,
+    shade: np.ndarray,
+    known: np.ndarray,
     resolution: float,
     origin: np.ndarray,
     notes: list[str],
@@ -123,17 +174,8 @@ def _to_map(
 ) -> OccupancyMap:
     """Map of an image; `meaning` is mode, negate, free_thresh and occupied_thresh."""
     mode, negate, free_below, occupied_above = meaning
-    shade, known = _read_image(image)
     probability = _occupancy_probability(shade, mode, negate)
-    known &= np.isfinite(probability)
-    if mode == "trinary" and not negate and UNKNOWN_PROBABILITY < free_below:
-        is_unknown = _written_as_unknown(shade)
-        if is_unknown.any():
-            known &= ~is_unknown
-            notes.append(
-                f"cells of the shade {UNKNOWN_SHADE}, which map_saver writes for unknown, stay "
-                f"unknown, although the free_thresh of {free_below:g} would make them free"
-            )
+    known = known & np.isfinite(probability)
     occupied = _image_to_grid(known & (probability > occupied_above))
     free = _image_to_grid(known & (probability < free_below))
     return OccupancyMap(occupied, free, resolution, origin, tuple(notes))
@@ -202,7 +244,9 @@ def _load(path: Path) -> Mapping[str, Any]:
     except ImportError:
         advice = "pip install 'jaxslam[ros]'"
         raise InputError("PyYAML is needed to read it", path=path, advice=advice) from None
-    advice = "name the YAML file of a map, as map_saver writes it"
+    advice = f"the YAML file of a map has the fields {', '.join(FIELDS)}"
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        advice += f", a picture ends in {', '.join(pictures.SUFFIXES)}"
     text = b""
     for _, part in lines(path):
         text += part
@@ -258,41 +302,3 @@ def _image_path(path: Path, name: Any) -> tuple[Path, list[str]]:
         advice = "put the image beside the YAML file and name it without its folder"
         raise InputError(problem, path=path, field="image", advice=advice)
     return image, notes
-
-
-def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Shade (H, W) float32 from 0 (black) to 1 (white), and whether opaque (H, W) bool."""
-    from PIL import Image, UnidentifiedImageError
-
-    advice = "name a PGM, PNG or BMP image"
-    try:
-        with warnings.catch_warnings():
-            # Pillow warns of its own limit; ours is checked below.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=FORMATS) as image:
-                width, height = image.size
-                if not 0 < width * height <= MAX_CELLS:
-                    problem = f"{width} x {height} cells are not between 1 and {MAX_CELLS}"
-                    raise InputError(problem, path=path, advice="cut the map into parts")
-                return _pixels(image)
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError("does not exist", path=path, advice="check its name") from None
-    except Image.DecompressionBombError:
-        raise InputError(f"has more than {MAX_CELLS} cells", path=path) from None
-    except UnidentifiedImageError:
-        raise InputError("is no image that can be read", path=path, advice=advice) from None
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot be read ({reason})", path=path, advice=advice) from None
-
-
-def _pixels(image: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Shade and opacity of an open Pillow image."""
-    if image.mode == "I" or image.mode.startswith("I;16"):  # 16 bits a pixel
-        shade = np.asarray(image).astype(np.float32) / np.float32(65535)
-        return shade, np.ones(shade.shape, bool)
-    values = np.asarray(image.convert("RGBA"))
-    shade = values[..., :3].mean(axis=2, dtype=np.float32) / np.float32(255)
-    return shade, values[..., 3] > 127

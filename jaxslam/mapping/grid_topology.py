@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import TopologicalMap
+from jaxslam.core.maps import MAX_RESOLUTION, TopologicalMap
 from jaxslam.core.types import JUNCTION, as_float64, check_array
 from jaxslam.mapping import medial_axis
 from jaxslam.mapping.cell_graph import CellGraph, trace_cells
@@ -68,7 +68,7 @@ def extract_topology(
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
         free: (H, W) bool; a cell that is neither is unknown.
-        resolution: [m] side of a cell.
+        resolution: [m] side of a cell, up to `MAX_RESOLUTION`.
         origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
         robot_radius: [m] The nodes keep this distance from what is not free; so do arcs, but for
             less than a cell where the simplified polyline cuts a bend. `arc_clearance` is that of
@@ -107,8 +107,9 @@ def _check_sizes(
     resolution: float, robot_radius: float, min_obstacle_size: float, min_region_area: float | None
 ) -> None:
     """Raise ValueError if a size is out of range."""
-    if not 0.0 < resolution < np.inf:
-        raise ValueError(f"resolution is {resolution}, not a positive number of metres")
+    if not 0.0 < resolution <= MAX_RESOLUTION:
+        problem = f"not a positive number of metres up to {MAX_RESOLUTION:g}"
+        raise ValueError(f"resolution is {resolution}, {problem}")
     for name, size, unit in (
         ("robot_radius", robot_radius, "metres"),
         ("min_obstacle_size", min_obstacle_size, "metres"),

@@ -9,7 +9,7 @@ from jaxslam.core.regions import Door, PlannerData, Regions, contains, outer_fir
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.mapping.clearance import clearance_at, clearance_field
 
-SPACING = 0.05  # [m] between the places of an arc that are looked at, at most
+SPACING = 0.05  # [m] between the places of an arc that are looked at, or half a cell if larger
 DOOR_MARGIN = 0.1  # [m] by which a door's line is longer than its jambs are apart, at either end
 
 
@@ -28,7 +28,8 @@ def planner_data(
     """
     check_types(graph, occupancy, regions)
     lines = graph.arc_lines
-    places = [polylines.resample(line, 2 + int(polylines.length(line) / SPACING)) for line in lines]
+    spacing = max(SPACING, 0.5 * occupancy.resolution)
+    places = [polylines.resample(line, 2 + int(polylines.length(line) / spacing)) for line in lines]
     last = np.cumsum([len(along) for along in places], dtype=int)
     points = np.concatenate([np.zeros((0, 2)), *places])
     widths = np.split(clearance_at(clearance_field(occupancy), points), last[:-1])

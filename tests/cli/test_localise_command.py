@@ -73,6 +73,27 @@ def test_a_folder_without_a_map_is_refused(refused, tmp_path):
     assert "does not exist" in refused(tmp_path / "a.clf", "--map", tmp_path / "none")
 
 
+@pytest.mark.parametrize("command", ["localise", "run"])
+def test_results_are_not_written_into_the_folder_of_the_map(tmp_path, capsys, command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "metrics.json").write_text("{}")
+    for out in ([] if command == "run" else ["--out", "out"], ["--out", str(folder)]):
+        assert main.main([command, "a.clf", "--map", "out", *out]) == 2
+        line = capsys.readouterr().err
+        assert line.startswith("jaxslam: error: --out: ") and line.count("\n") == 1
+        assert "out is the folder of the map, whose results would be replaced; name" in line
+    assert [file.name for file in folder.iterdir()] == ["metrics.json"]
+
+
+def test_without_out_a_localisation_has_a_folder_of_its_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    assert main.main(["localise", "a.clf", "--map", "out"]) == 2
+    assert "holds no map.npz" in capsys.readouterr().err
+
+
 def test_a_log_without_scans_is_refused(refused, saved):
     (saved / "a.clf").write_text("ODOM 0 0 0 0 0 0 1 host 1\n")
     assert refused(saved / "a.clf", "--map", saved).startswith(f"{saved / 'a.clf'}: ")

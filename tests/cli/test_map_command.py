@@ -9,7 +9,7 @@ from PIL import Image
 
 from jaxslam.cli import main, map_files
 from jaxslam.core.maps import OccupancyMap, TopologicalMap
-from jaxslam.io import graphml, rooms_file, ros_map
+from jaxslam.io import graphml, map_folder, rooms_file, ros_map
 from jaxslam.viz import canvas, maps
 
 FILES = {"metrics.json", "map.geojson", "map.graphml", "map.lif.json", "map.rmf.yaml", "map.png"}
@@ -51,7 +51,7 @@ def test_map_counts_what_it_found(done):
     expected = {"nodes": 2, "arcs": 2, "dead_ends": 1, "rings": 1, "regions": 1}
     assert expected.items() <= numbers.items()
     assert numbers["length_m"] == pytest.approx(2 * 4.9 + 2 * 4.4 + 2.5 - 1.0, abs=0.5)
-    assert 0.4 < numbers["narrowest_m"] < 0.6 and numbers["clearance_m"] == 0.25
+    assert 0.4 < numbers["narrowest_m"] < 0.6 and numbers["robot_radius_m"] == 0.25
     assert 0.0 < numbers["reached_m2"] < 30.0 and numbers["left_out_m2"] == 0.0
     assert numbers["seconds"]["run"] > 0.0
 
@@ -142,6 +142,42 @@ def test_map_refuses_what_is_no_map(refused, tmp_path):
     assert "a.pgm: does not exist" in refused(path)
 
 
+def test_map_does_not_replace_the_map_of_a_run(refused, tmp_path):
+    path = write_map(tmp_path)
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "map.npz").write_bytes(b"")
+    path = write_map(results)
+    assert "results is the folder of the map, whose results would be replaced" in refused(path)
+
+
+@pytest.mark.parametrize(
+    "field, value, problem",
+    [
+        ("resolution: 0.1", "resolution: 1.0e+6", "resolution: 1e+06 is not between 0.001 and 100"),
+        ("resolution: 0.1", "resolution: 1.0e-4", "resolution: 0.0001 is not between 0.001 and"),
+        ("-2.0, 1.0, 0.0", "1.0e+9, 0, 0", "origin: the map has coordinates of 1e+09, beyond 1e"),
+        ("-2.0, 1.0, 0.0", "0, 9999995.0, 0", "origin: the map has coordinates of 1e+07, beyond"),
+        ("-2.0, 1.0, 0.0", "0, 0, 1.0e+8", "origin: the map has coordinates of 1e+08, beyond"),
+    ],
+)
+def test_map_refuses_what_other_commands_would(refused, tmp_path, field, value, problem):
+    path = write_map(tmp_path)
+    path.write_text(YAML.replace(field, value))
+    assert f"a.yaml: {problem}" in refused(path)
+
+
+@pytest.mark.parametrize("resolution, x", [(0.1, 9.99998e6), (100.0, -9.99e6)])
+def test_what_map_writes_at_its_limits_can_be_read(tmp_path, resolution, x):
+    path = write_map(tmp_path)
+    path.write_text(YAML.replace("0.1\n", f"{resolution}\n").replace("-2.0", f"{x:.1f}"))
+    assert run_map(path, "--out", tmp_path / "out") == 0
+    known = map_folder.read_map_folder(tmp_path / "out")
+    assert len(known.graph.arc_lines) >= 2 and known.regions is not None
+    area = sum(region.area for region in known.regions.regions)
+    assert area > 1000 * resolution**2
+
+
 def test_map_refuses_a_map_without_free_space(refused, tmp_path):
     assert "a.yaml: has no free space" in refused(write_map(tmp_path, np.zeros((9, 9), bool)))
     assert "5 m" in refused(write_map(tmp_path), "--robot-radius", 5.0)
@@ -211,6 +247,34 @@ def test_rooms_of_a_map(tmp_path, capsys):
     written = ros_map.read(out / "map.yaml")
     assert written.free.shape == (220, 90) and written.resolution == 0.05
     np.testing.assert_array_equal(written.free, picture[::-1].any(axis=2).T)
+
+
+def test_a_plan_with_grey_walls_is_a_plan(tmp_path, capsys):
+    numbers = []
+    for wall in (0, 90, 128, 205):
+        shade = np.asarray(Image.open(write_rooms_plan(tmp_path)))
+        plan = tmp_path / f"{wall}.png"
+        Image.fromarray(np.where(shade == 255, 255, wall).astype(np.uint8)).save(plan)
+        assert run_map(plan, "--resolution", 0.05, "--out", tmp_path / str(wall)) == 0
+        said = capsys.readouterr().out
+        note = f"note: the darkest shade is {wall} of 255, so that all below "
+        assert (note in said) == (wall > 0) and said.count("note: ") == (wall > 0)
+        numbers.append(json.loads((tmp_path / str(wall) / "metrics.json").read_text()))
+        del numbers[-1]["seconds"]
+    assert numbers[0]["rooms"] == 2 and numbers[0]["arcs"] > 0
+    assert numbers[1:] == 3 * numbers[:1]
+
+
+def test_rooms_without_an_arc_are_named(tmp_path, capsys):
+    free = np.zeros((220, 90), bool)
+    free[5:105, 5:85] = free[110:210, 5:85] = True
+    free[105:110, 30:34] = True  # 0.2 m, narrower than the robot
+    Image.fromarray(np.where(free, 255, 0).astype(np.uint8).T[::-1]).save(tmp_path / "a.png")
+    assert run_map(tmp_path / "a.png", "--resolution", 0.05, "--out", tmp_path / "out") == 0
+    names = {region.name for region in rooms_file.read_rooms(tmp_path / "out").regions}
+    (line,) = [s for s in capsys.readouterr().out.splitlines() if s.startswith("note: ")]
+    assert line.startswith("note: rooms without an arc: ") and len(names) == 2
+    assert set(line.removeprefix("note: rooms without an arc: ").split(", ")) <= names
 
 
 def test_rooms_keep_their_names_in_the_same_folder(tmp_path, capsys):

@@ -74,7 +74,7 @@ def test_a_route_is_written_and_printed(floor, rooms, tmp_path, capsys):
     assert [leg["region"] for leg in found["legs"]] == ["room_1", "room_2"]
     assert found["legs"][0]["door_width_m"] == 0.8 and found["legs"][1]["door_width_m"] is None
     assert 0.2 < found["narrowest_m"] <= 0.4 and numbers["doors"] == 1
-    assert numbers["clearance_m"] == found["robot_radius_m"] == 0.25
+    assert numbers["robot_radius_m"] == found["robot_radius_m"] == 0.25
 
 
 def test_the_picture_has_its_size_and_shows_the_route(floor, rooms, tmp_path):
@@ -103,7 +103,7 @@ def test_a_room_is_a_goal(floor, rooms, tmp_path, capsys):
 
 def test_without_an_occupancy_map_a_note_says_so(floor, tmp_path, capsys):
     shutil.copy(floor / "map.geojson", tmp_path)
-    assert run(tmp_path, "--from", -3, 0.5, "--to", 3, 0.5, "--out", tmp_path) == 0
+    assert run(tmp_path, "--from", -3, 0.5, "--to", 3, 0.5, "--out", tmp_path / "out") == 0
     assert capsys.readouterr().out.startswith("note: no map.yaml: obstacles beside")
 
 
@@ -175,6 +175,31 @@ def test_bad_folders_and_radii_are_one_line(refused, tmp_path, floor):
     (tmp_path / "bare" / "rooms.json").unlink()
     line = refused(tmp_path / "bare", "--from", -3, -1, "--to", "room_1")
     assert line.startswith("--to: 'room_1', and the")
+
+
+def test_a_route_is_not_written_into_the_folder_of_the_map(floor, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "out"
+    shutil.copytree(floor, folder)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    (tmp_path / "link").symlink_to(folder)
+    for given, out in ((folder, folder), (folder / "map.geojson", tmp_path / "link")):
+        assert run(given, "--from", -3, -1, "--to", 3, 1, "--out", out) == 2
+        assert capsys.readouterr().err == (
+            f"jaxslam: error: --out: {out} is the folder of the map, whose results would be "
+            "replaced; name another folder\n"
+        )
+    monkeypatch.chdir(tmp_path)
+    assert run("out", "--from", -3, -1, "--to", 3, 1) == 0
+    assert {file.name for file in (tmp_path / "route").iterdir()} == FILES
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_the_help_says_where_in_a_room_a_route_ends(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        run("--help")
+    said = capsys.readouterr().out  # the line breaks of the docstring are not in it
+    assert "as in room_12: the route ends on an arc inside, 1 m from its doors if it is" in said
 
 
 def test_an_interrupt_leaves_nothing_behind(floor, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import jaxslam
-from jaxslam.cli import main
+from jaxslam.cli import main, usage
 
 
 def printed_help(capsys, *arguments):
@@ -32,18 +32,44 @@ def test_version(capsys):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["simulate", "--trials", "many"], ["fly"], ["simulate", "--labels", "x"]]
+    "arguments, line",
+    [
+        ("fly", "fly: is no command; the commands are simulate, run, localise, map, route, tune"),
+        ("rout out", "rout: is no command; did you mean route?"),
+        ("--fly", "--fly: is no command; the commands are"),
+        ("map a.png --resolution abc", "--resolution: 'abc' is no number; write --resolution M"),
+        ("simulate --trials 1.5", "--trials: '1.5' is no whole number; write --trials N"),
+        ("run a --scan=", "--scan: '' is no whole number; write --scan N"),
+        ("map a --regions x", "--regions: 'x' is none of largest, all; write --regions largest|"),
+        ("run a --rerun x", "--rerun: 'x' is none of live, file; write --rerun {live,file}"),
+        ("map a --out", "--out: has no value; write --out DIR"),
+        ("run a --mount 1 2", "--mount: has 2 values, not 3; write --mount X Y YAW"),
+        ("tune --mount 1 -2 x", "--mount: 'x' is no number; write --mount X Y YAW"),
+        ("run a --gif=no", "--gif: has 1 value, not 0; write --gif"),
+        ("map a --robot-radiu 3", "--robot-radiu: is no option of `jaxslam map`; did you mean "),
+        ("map a --bogus 3", "--bogus: is no option of `jaxslam map`; see `jaxslam map --help`"),
+        ("map a -o 3", "-o: is no option of `jaxslam map`; see `jaxslam map --help`"),
+        ("map a b", "b: is one argument too many; write `jaxslam map MAP` and then options"),
+        ("simulate 3", "3: is one argument too many; write `jaxslam simulate` and then options"),
+        ("map", "MAP: is missing; write `jaxslam map MAP` and then options"),
+        ("run", "LOG: is missing; name one log, or several"),
+        ("localise a", "--map: is missing; write `jaxslam localise LOG --map DIR` and then"),
+        ("route", "MAP, --from, --to: are missing; write `jaxslam route MAP --from X Y --to X Y|"),
+        ("run a --strict b", "Unrecognized options: b; see `jaxslam run --help`"),
+    ],
 )
-def test_wrong_usage_exits_2(arguments, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main.main(arguments)
-    assert stopped.value.code == 2
-    assert capsys.readouterr().err
+def test_wrong_usage_is_one_line(arguments, line, capsys):
+    assert main.main(arguments.split()) == 2
+    said, errors = capsys.readouterr()
+    assert errors.startswith(f"jaxslam: error: {line}") and errors.count("\n") == 1 and not said
 
 
-def test_a_run_without_a_log_is_one_line(capsys):
-    assert main.main(["run"]) == 2
-    assert capsys.readouterr().err == "jaxslam: error: LOG: is missing; name one log, or several\n"
+def test_what_a_parser_says_in_a_box_becomes_a_line():
+    text = "/- Error -\\\n| Bad --a |\n| value. |\n| ------- |\n| Help |\n\\---------/"
+    assert usage.first_paragraph(text) == "Bad --a value."
+    drawn = text.translate({ord("|"): "\u2502", ord("-"): "\u2500"}).replace("\u2500\u2500a", "--a")
+    assert usage.first_paragraph(drawn) == "Bad --a value."
+    assert usage.first_paragraph("") == "wrong arguments"
 
 
 def test_help_says_in_a_line_what_each_command_does(capsys):
@@ -75,6 +101,8 @@ def test_help_of_a_command_explains_its_options(capsys, command):
     )
     assert set(OPTIONS[command].split()) <= set(text.replace(",", " ").split())
     assert "None" not in text
+    known = {argument.name for argument in usage.arguments_of(main.function_of(command))}
+    assert {word for word in OPTIONS[command].split()} <= known
     if "--noise" in OPTIONS[command]:
         assert "noise parameters of the filter (Q and R)" in text
 

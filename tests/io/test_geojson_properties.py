@@ -451,8 +451,17 @@ def set_member(number, **values):
         ),
         (
             set_property(5, metadata={"arc": 0}),
-            "features[5].properties.metadata.arc: 0 is that of an edge before",
+            "features[5].properties.metadata.arc: 0 is also that of features[3] and features[4]",
         ),
+        (
+            set_property(4, startid=4),
+            "features[4].properties.metadata.arc: 0 is also that of features[3], and an arc has",
+        ),
+        (
+            set_property(3, startid=77),
+            "features[3].properties.startid: 77 is the id of no node; wr",
+        ),
+        (set_property(4, endid=77), "features[4].properties.endid: 77 is the id of no node; wr"),
         (set_member(2, properties=[]), "features[2].properties: is list, not an object"),
         (set_member(2, properties="a"), "features[2].properties: is str, not an object"),
         (set_member(2, geometry=3), "features[2].geometry: is int, not an object"),

@@ -1,8 +1,11 @@
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_building import ARC_WIDTHS, building, planner, regions
 
+from jaxslam.cli import report
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.types import JUNCTION
 from jaxslam.io import graphml
@@ -33,13 +36,14 @@ def test_networkx_reads_the_map(tmp_path, convert):
     graphml.write(tmp_path / "map.graphml", numbers)
     found = networkx.read_graphml(tmp_path / "map.graphml", force_multigraph=True)
     assert dict(found.nodes(data=True)) == {
-        "5": {"name": "5", "x": 0.0, "y": 0.5, "clearance": 1.0},
-        "8": {"name": "8", "x": 2.0, "y": 0.0},
+        "5": {"name": "5", "kind": "node", "x": 0.0, "y": 0.5, "clearance": 1.0},
+        "8": {"name": "8", "kind": "node", "x": 2.0, "y": 0.0},
     }
     line = "LINESTRING (0.0 0.5, 2.0 0.0)"
     (arc,) = found.get_edge_data("5", "8").values()
     names = {"arc": 0, "start": "5", "end": "8"}
-    assert arc == names | {"length": 2.5, "clearance": 0.75, "line": line}
+    more = {"length": 2.5, "clearance": 0.75, "line": line, "speed_limit": 93.8}
+    assert arc == names | more
     (loop,) = found.get_edge_data("8", "8").values()
     assert loop["length"] == 3.0 and "clearance" not in loop and loop["arc"] == 1
 
@@ -49,13 +53,35 @@ def test_networkx_reads_regions_doors_and_widths(tmp_path):
     found = networkx.read_graphml(tmp_path / "map.graphml", force_multigraph=True)
     nodes = {name: (data.get("region"), data.get("class")) for name, data in found.nodes.items()}
     corridor, room = ("room_2", "corridor"), ("room_1", "room")
-    assert nodes == {"5": corridor, "7": (None, None), "8": corridor, "11": room}
+    none = (None, None)
+    assert nodes == {"5": corridor, "7": none, "8": corridor, "11": room, "30": none}
     arcs = {data["arc"]: data for *_, data in found.edges(data=True)}
     assert (arcs[0]["region"], arcs[0]["class"]) == ("room_2", "door")
     assert arcs[0]["door"] == "door_3,door_4" and "door" not in arcs[1]
     widths = [float(width) for width in arcs[1]["widths"].split(",")]
     np.testing.assert_array_equal(widths, ARC_WIDTHS[1])
     assert arcs[0]["clearance"] == 0.45 and "clearance" not in arcs[2] and "class" not in arcs[2]
+
+
+def test_open_ends_are_nodes_as_in_the_geojson(tmp_path):
+    line = np.array([[2.0, 0.0], [3.0, 0.0], [3.0, 2.0]])
+    graph = topological_map()._replace(
+        frontiers=(line,), frontier_node=np.array([1]), frontier_id=np.array([9])
+    )
+    report.write_map(tmp_path / "map.geojson", graph)
+    graphml.write(tmp_path / "map.graphml", graph)
+    found = networkx.read_graphml(tmp_path / "map.graphml", node_type=int, force_multigraph=True)
+    assert found.nodes[9] == {"name": "9", "kind": "frontier", "x": 3.0, "y": 2.0}
+    (arc,) = found.get_edge_data(8, 9).values()
+    assert (arc["arc"], arc["start"], arc["end"], arc["length"]) == (2, "8", "9", 3.0)
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    points = {
+        f["properties"]["id"]: f["properties"]["metadata"]["kind"]
+        for f in features
+        if f["geometry"]["type"] == "Point"
+    }
+    assert points == dict(found.nodes(data="kind"))
+    assert len(features) == len(found) + 2 * found.number_of_edges()
 
 
 def test_igraph_reads_all_nodes_and_arcs_by_their_names(tmp_path):
@@ -73,6 +99,9 @@ def test_igraph_reads_all_nodes_and_arcs_by_their_names(tmp_path):
         arc_length=rng.uniform(size=len(ends)),
         arc_clearance=rng.uniform(size=len(ends)),
         arc_lines=tuple(rng.normal(size=(len(ends), 3, 2))),
+        frontiers=(),
+        frontier_node=np.zeros(0, int),
+        frontier_id=np.zeros(0, int),
     )
     graphml.write(tmp_path / "map.graphml", graph)
     found = igraph.Graph.Read_GraphML(str(tmp_path / "map.graphml"))

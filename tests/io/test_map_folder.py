@@ -142,7 +142,19 @@ def test_what_is_no_map_is_refused(folder):
     (folder / "file").write_text("")
     with pytest.raises(InputError, match="file: is no folder; name"):
         read_map_folder(folder / "file")
-    with pytest.raises(InputError, match=r"map.geojson: node 3: has no position; give it"):
+    advice = "correct it, or make the map anew with `jaxslam run` or `jaxslam map`"
+    with pytest.raises(InputError, match=rf"features\[0\]: is no Feature; {advice}"):
+        edit(folder, lambda features: features.insert(0, {}))
+    geojson.write(folder / "map.geojson", NODES, ARCS)
+    (folder / "rooms.json").write_text("{}")
+    advice = "correct it, or remove the file to do without its rooms"
+    with pytest.raises(InputError, match=f"format: is no jaxslam-rooms file; {advice}"):
+        read_map_folder(folder)
+    (folder / "rooms.json").unlink()
+    assert read_map_folder(folder).regions is None
+    with pytest.raises(
+        InputError, match=r"map.geojson: node 3: has no position within 1e\+07 m of 0, 0; give"
+    ):
         edit(folder, lambda features: features[0]["geometry"].update(coordinates=["a", 1]))
     geojson.write(folder / "map.geojson", NODES, ARCS)
     with pytest.raises(InputError, match=r"map.geojson: line 99: are no points of a line"):

@@ -301,6 +301,7 @@ def test_the_callback_is_given_the_stages_as_they_begin():
         ({"origin": "here"}, "origin is .*, not numbers"),
         ({"resolution": 0.0}, "resolution is 0.0, not a positive number"),
         ({"resolution": np.inf}, "resolution is inf, not a positive number"),
+        ({"resolution": 1e6}, "resolution is 1000000.0, not a positive number of metres up to 100"),
         ({"robot_radius": -0.1}, "robot_radius is -0.1, not a number of metres >= 0"),
         ({"min_obstacle_size": np.nan}, "min_obstacle_size is nan"),
         ({"min_region_area": -1.0}, "min_region_area is -1.0, not a number of square metres >= 0"),

@@ -85,6 +85,17 @@ def test_the_profile_of_a_straight_arc_knows_the_door_between_its_ends():
     assert arc_clearances(made, data)[0] == pytest.approx(0.5, abs=0.05)
 
 
+def test_arcs_of_coarse_maps_are_sampled_by_the_cell(monkeypatch):
+    counts, resample = [], polylines.resample
+    monkeypatch.setattr(
+        polylines, "resample", lambda line, count: counts.append(count) or resample(line, count)
+    )
+    grid = floor.occupancy()._replace(resolution=1e5 * floor.RESOLUTION)
+    coarse = graph()._replace(arc_lines=tuple(1e5 * line for line in graph().arc_lines))
+    planner_data(coarse, grid, floor.regions())
+    assert counts and max(counts) < 1000
+
+
 def test_a_map_without_nodes_has_no_data():
     bare = straight_graph(np.zeros((0, 2)), np.zeros((0, 2), int))
     found = planner_data(bare, floor.occupancy(), floor.regions())

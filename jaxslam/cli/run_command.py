@@ -24,7 +24,6 @@ from jaxslam.cli.options import (
     OutFolder,
     check_range,
     name_errors,
-    require_other_folder,
 )
 from jaxslam.cli.run_evaluation import RecordedDrive, without_errors
 from jaxslam.cli.run_results import RunContext
@@ -123,11 +122,9 @@ def run(
         rerun: Show the run in the rerun viewer while it is processed (live), or write run.rrd for
             it (file); needs the extra [view].
         strict: Exit with code 3 if the map contradicts itself; all results are still written.
-        out: Folder for the results, not that of --map.
+        out: Folder for the results; that of --map is brought up to date.
     """
     check_range("--robot-radius", robot_radius, 0.01, 100.0)
-    if saved_map is not None:
-        require_other_folder(out, saved_map)
     logs = [_read(path, scanner, odometry, scan_topic, odometry_topic) for path in log]
     if not logs:
         raise InputError("is missing", field="LOG", advice="name one log, or several")

@@ -213,12 +213,14 @@ def compute(
                 print(line_of(row), flush=True)
             rows += found
             if subject.poses is not None:
-                pictures[subject.name] = picture_of(subject.occupancy, subject.roadmaps["grid"])
+                pictures[subject.name] = picture_of(
+                    subject.occupancy, subject.roadmaps["grid"], ROBOT_RADIUS
+                )
     numbers = range(1000 * seed, 1000 * seed + num_plans)
     plans = [plan_row(number) for number in tqdm(numbers, unit="plan", leave=False)]
     drawn = max(
         (row for row in rows if row["method"] == "merged"),
-        key=lambda row: (row["kind"] == "log", row["detour_median"] or 0.0),
+        key=lambda row: (row["kind"] == "log", len(pictures[row["name"]]["rooms"])),
     )
     return {
         "seed": seed,

@@ -8,7 +8,10 @@ from experiments import common
 from experiments.common import Numbers
 from experiments.roadmaps import Roadmap
 from jaxslam.core.maps import OccupancyMap
+from jaxslam.core.regions import Door, Region, Regions
 from jaxslam.core.se2_np import inverse_transform
+from jaxslam.mapping.rooms import find_regions
+from jaxslam.viz.rooms import draw_rooms
 
 COARSE = 2  # cells of the map, along each side, in one of the picture
 WALL, FREE, UNKNOWN = "#", ".", " "
@@ -23,11 +26,18 @@ ALL = 0.995  # share of the pairs that are joined, below which it is written
 KINDS = {"log": "", "hall": "hall: ", "map": "map: "}
 
 
-def picture_of(occupancy: OccupancyMap, roadmap: Roadmap) -> Numbers:
-    """What is drawn of a map: its cells as lines of text, y ascending, and its graph.
+def picture_of(occupancy: OccupancyMap, roadmap: Roadmap, robot_radius: float) -> Numbers:
+    """What is drawn of a map: its cells as lines of text, y ascending, its graph, rooms and doors.
 
     Positions are in the frame of the grid [m].
     """
+    rooms = find_regions(
+        occupancy.occupied,
+        occupancy.free,
+        resolution=occupancy.resolution,
+        origin=np.zeros(3),
+        robot_radius=robot_radius,
+    )
     rows, columns = (COARSE * (n // COARSE) for n in occupancy.free.shape)
 
     def coarse(cells: np.ndarray) -> np.ndarray:
@@ -41,11 +51,16 @@ def picture_of(occupancy: OccupancyMap, roadmap: Roadmap) -> Numbers:
         "cells": ["".join(line) for line in letters.tolist()],
         "nodes": inverse_transform(occupancy.origin, roadmap.xy[~roadmap.is_open]).round(2),
         "lines": [inverse_transform(occupancy.origin, x).round(2) for x in roadmap.lines],
+        "rooms": [
+            {"name": room.name, "rings": [ring.round(2) for ring in (room.polygon, *room.holes)]}
+            for room in rooms.regions
+        ],
+        "doors": [door.jambs.round(2) for door in rooms.doors],
     }
 
 
 def draw(numbers: Numbers, path: Path) -> None:
-    """The graph of one log over its map, and the detours of all graphs."""
+    """The graph, rooms and doors of one log over its map, and the detours of all graphs."""
     figure, axes = common.canvas(9.0, 4.6, 1, 2, [6, 5])
     _draw_graph(axes[0, 0], numbers["drawn"])
     _draw_detours(axes[0, 1], numbers["graphs"])
@@ -60,13 +75,32 @@ def _draw_graph(axis, drawn: Numbers) -> None:
     height, width = cells.shape
     extent = (0.0, width * size, 0.0, height * size)
     axis.imshow(shade, origin="lower", extent=extent, cmap="gray", vmin=0.0, vmax=1.0)
-    for line in drawn["lines"]:
-        axis.plot(*np.array(line).T, color=common.BLUE, linewidth=0.9)
-    axis.plot(*np.array(drawn["nodes"]).T, ".", color=common.RED, markersize=3.5)
     rows, columns = (np.flatnonzero(known.any(axis=side)) for side in (1, 0))
     axis.set(xlim=(columns[0] * size, (columns[-1] + 1) * size))
     axis.set(ylim=(rows[0] * size, (rows[-1] + 1) * size), aspect="equal")
-    axis.set(title=f"{drawn['name']}: topological map", xlabel="x [m]", ylabel="y [m]")
+    draw_rooms(axis, _regions(drawn))
+    for line in drawn["lines"]:
+        axis.plot(*np.array(line).T, color=common.BLUE, linewidth=0.9)
+    axis.plot(*np.array(drawn["nodes"]).T, ".", color=common.RED, markersize=3.5)
+    axis.set(title=f"{drawn['name']}: rooms, doors and routes", xlabel="x [m]", ylabel="y [m]")
+
+
+def _regions(drawn: Numbers) -> Regions:
+    """The rooms and doors that are drawn."""
+    rooms = [[np.array(ring) for ring in room["rings"]] for room in drawn["rooms"]]
+    return Regions(
+        label=np.zeros((0, 0), np.int32),
+        regions=tuple(
+            Region(room["name"], "room", rings[0], 1.0, (), (), tuple(rings[1:]))
+            for room, rings in zip(drawn["rooms"], rooms, strict=True)
+        ),
+        doors=tuple(
+            Door(f"door_{k}", np.mean(jambs, axis=0), np.array(jambs), 1.0, (0, 0))
+            for k, jambs in enumerate(drawn["doors"], start=1)
+        ),
+        resolution=1.0,
+        origin=np.zeros(3),
+    )
 
 
 def _draw_detours(axis, rows: list[Numbers]) -> None:

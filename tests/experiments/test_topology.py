@@ -242,7 +242,7 @@ def test_rows_and_picture_of_a_subject(tmp_path):
     assert "rooms" in topology.line_of(rows[0])
     numbers = {
         "graphs": rows,
-        "drawn": {"name": "rooms", **topology_picture.picture_of(room, graph)},
+        "drawn": {"name": "rooms", **topology_picture.picture_of(room, graph, RADIUS)},
     }
     topology.common.save(tmp_path, "topology", numbers, topology_picture.draw)
     assert (tmp_path / "topology.png").stat().st_size > 10_000

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jaxslam.simulation.worlds import World
 
 MAX_HITS = 40_000  # end points of beams drawn at most
+MAX_PIXELS = 2000  # of a drawn grid, along its longer side
 
 # Colour, line width, line style and zorder of each trajectory.
 TRAJECTORY_STYLES: dict[str, tuple[str, float, Any, float]] = {
@@ -196,20 +197,25 @@ def _cells_to_map(grid: OccupancyMap) -> Affine2D:
 def draw_occupancy(axis: Axes, grid: OccupancyMap) -> None:
     """Draw an occupancy grid: occupied cells dark, unknown ones grey.
 
+    Of a large grid squares of cells are drawn, dark where any of them is occupied.
+
     Raises:
         ValueError: The cells do not have one shape (H, W).
     """
     occupied, free = np.asarray(grid.occupied), np.asarray(grid.free)
     check_array("grid.occupied", occupied, ("H", "W"), np.bool_)
     check_array("grid.free", free, occupied.shape, np.bool_)
-    image = np.where(free, 255, 205).astype(np.uint8)
+    image = np.where(free, np.uint8(255), np.uint8(205))
     image[occupied] = 60
+    side = max(1, -(-max(image.shape) // MAX_PIXELS))
+    for k in range(2):
+        image = np.minimum.reduceat(image, np.arange(0, image.shape[k], side), axis=k)
     limits = axis.get_xlim(), axis.get_ylim()
     axis.set_facecolor((205 / 255,) * 3)
     axis.imshow(
         image.T,
         origin="lower",
-        extent=(0, image.shape[0], 0, image.shape[1]),
+        extent=(0, side * image.shape[0], 0, side * image.shape[1]),
         transform=_cells_to_map(grid) + axis.transData,
         cmap="gray",
         vmin=0,

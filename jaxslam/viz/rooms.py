@@ -69,8 +69,11 @@ def _draw_numbers(axis: Axes, regions: Regions) -> None:
     height = FONT_SIZE * axis.figure.dpi / 72.0 * dot  # [m] of a digit
     for region in regions.regions:
         number = region.name.partition("_")[2]
+        needed = 0.5 * height * np.hypot(_DIGIT * len(number), 1.0)
+        if needed > 0.5 * np.ptp(region.polygon, axis=0).min():
+            continue
         middle, clearance = innermost(region)
-        if 0.5 * height * np.hypot(_DIGIT * len(number), 1.0) <= clearance:
+        if needed <= clearance:
             axis.text(
                 middle[0],
                 middle[1],

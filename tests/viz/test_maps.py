@@ -199,3 +199,15 @@ def test_a_diagram_of_another_grid_is_refused(axis):
     diagram = Diagram(labels=jnp.zeros((3, 3), jnp.uint32), arrival=jnp.zeros((3, 3), jnp.int32))
     with pytest.raises(ValueError, match="diagram.labels is uint32"):
         landmarks.draw_local_diagram(axis, diagram, np.zeros((3, 3), bool), Config().frontend.grid)
+
+
+def test_a_large_grid_is_drawn_in_squares_that_keep_thin_walls(axis):
+    free = np.ones((4500, 20), bool)
+    free[3001] = False  # a wall of one cell
+    maps.draw_occupancy(axis, OccupancyMap(~free, free, 0.05, np.array([1.0, 2.0, 0.0])))
+    (image,) = axis.images
+    pixels = np.asarray(image.get_array()).T
+    assert pixels.shape == (1500, 7)
+    np.testing.assert_array_equal(np.flatnonzero((pixels == pixels.min()).all(axis=1)), [1000])
+    far = (image.get_transform() - axis.transData).transform(image.get_extent()[1::2])
+    np.testing.assert_allclose(far, [1.0 + 225.0, 2.0 + 1.05])

@@ -16,6 +16,7 @@ from jaxslam.pipeline.online import init as init
 from jaxslam.pipeline.online import match_log as match_log
 from jaxslam.pipeline.online import topological_map as topological_map
 from jaxslam.pipeline.online import update as update
+from jaxslam.pipeline.online import whole_map as whole_map
 from jaxslam.pipeline.results import SlamResult as SlamResult
 from jaxslam.pipeline.saving import to_saved_map as to_saved_map
 from jaxslam.pipeline.stacking import stack_episodes as stack_episodes

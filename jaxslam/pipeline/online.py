@@ -3,7 +3,8 @@
     state = init(config, start)
     for odometry, ranges in portions:       # of 1 to `CHUNK` scans
         state, result = update(config, params, state, odometry, ranges)
-    topological_map(config, state, poses)
+    topological_map(config, state, poses)                  # of single scans, merged
+    state, found = whole_map(config, state, poses, scans)  # of all scans in one grid
 
 Pose and map are available after each portion. `offline.run_slam` does the same for a whole log.
 """
@@ -12,6 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import trace_cache
@@ -25,6 +27,8 @@ from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.mapping import arc_table
 from jaxslam.mapping.arc_table import ArcTable
+from jaxslam.mapping.global_map import RESOLUTION, GlobalMap, build_global_map, moved_with_poses
+from jaxslam.mapping.occupancy import occupancy_map
 from jaxslam.mapping.topological_map import build_map
 from jaxslam.matching import scan_matching
 from jaxslam.matching.icp import ScanMatchSpec, Submap
@@ -136,6 +140,55 @@ def topological_map(config: Config, state: SlamState, poses: Any) -> Topological
         min_separation=config.filter.association.min_separation,
         max_log_clearance_ratio=config.filter.association.max_log_clearance_ratio,
     )
+
+
+def whole_map(
+    config: Config,
+    state: SlamState,
+    poses: Any,
+    scans: Any,
+    *,
+    previous: TopologicalMap | None = None,
+    previous_poses: Any = None,
+) -> tuple[SlamState, GlobalMap]:
+    """Topological map of all scans so far, drawn into one grid, as `run_slam` makes at the end.
+
+    It is made anew from the poses as they are estimated now; nodes and open ends of `previous`
+    that are still there, after they have moved with the poses, keep their ids.
+
+    Args:
+        config: Of the filter; `config.mapping.robot_radius` is the least clearance of arcs.
+        state: The state after the last scan.
+        poses: (T, 3) [m, m, rad] trajectory up to it, map frame.
+        scans: (T, R) raw ranges [m], or a `Scan` [T], from there.
+        previous: The graph of an earlier call.
+        previous_poses: (K, 3) [m, m, rad] poses of that call, K <= T.
+
+    Returns:
+        The state, in which no later landmark will have an id of a node, and the map.
+
+    Raises:
+        ValueError: Poses, scans or previous poses do not fit each other.
+    """
+    arguments.check_config(config)
+    poses = as_float64("poses", poses, ("T", 3))
+    lidar = config.frontend.lidar
+    scans = arguments.as_scans(lidar, scans, len(poses))
+    if previous is not None:
+        before = as_float64("previous_poses", previous_poses, ("K", 3))
+        if not 0 < len(before) <= len(poses):
+            raise ValueError(f"previous_poses has {len(before)} rows, poses {len(poses)}")
+        previous = moved_with_poses(previous, before, poses[: len(before)])
+    found = build_global_map(
+        occupancy_map(lidar, poses, scans, resolution=RESOLUTION),
+        poses,
+        topological_map(config, state, poses),
+        int(state.belief.next_id),
+        previous=previous,
+        robot_radius=config.mapping.robot_radius,
+    )
+    next_id = jnp.asarray(found.next_id, state.belief.next_id.dtype)
+    return state._replace(belief=state.belief._replace(next_id=next_id)), found
 
 
 def match_log(

@@ -49,6 +49,7 @@ from jaxslam.simulation import floor_plans
 NAME = "topology"
 ROBOT_RADIUS = 0.2  # [m]
 GRID, MERGED = MappingSpec("grid", ROBOT_RADIUS), MappingSpec("merged")
+LARGE_ROOM = 8.0  # [m^2] The log with the most rooms as large as this is drawn.
 HALL_SPACING, PLAN_SPACING = 4.0, 1.5  # [m] between the places that a drive visits
 
 
@@ -220,7 +221,7 @@ def compute(
     plans = [plan_row(number) for number in tqdm(numbers, unit="plan", leave=False)]
     drawn = max(
         (row for row in rows if row["method"] == "merged"),
-        key=lambda row: (row["kind"] == "log", len(pictures[row["name"]]["rooms"])),
+        key=lambda row: (row["kind"] == "log", _large_rooms(pictures[row["name"]])),
     )
     return {
         "seed": seed,
@@ -232,6 +233,10 @@ def compute(
         },
         "drawn": {"name": drawn["name"], **pictures[drawn["name"]]},
     }
+
+
+def _large_rooms(drawn: Numbers) -> int:
+    return sum(room["area_m2"] >= LARGE_ROOM for room in drawn["rooms"])
 
 
 def line_of(row: Numbers) -> str:

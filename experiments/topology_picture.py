@@ -52,7 +52,11 @@ def picture_of(occupancy: OccupancyMap, roadmap: Roadmap, robot_radius: float) -
         "nodes": inverse_transform(occupancy.origin, roadmap.xy[~roadmap.is_open]).round(2),
         "lines": [inverse_transform(occupancy.origin, x).round(2) for x in roadmap.lines],
         "rooms": [
-            {"name": room.name, "rings": [ring.round(2) for ring in (room.polygon, *room.holes)]}
+            {
+                "name": room.name,
+                "area_m2": room.area,
+                "rings": [ring.round(2) for ring in (room.polygon, *room.holes)],
+            }
             for room in rooms.regions
         ],
         "doors": [door.jambs.round(2) for door in rooms.doors],
@@ -91,7 +95,7 @@ def _regions(drawn: Numbers) -> Regions:
     return Regions(
         label=np.zeros((0, 0), np.int32),
         regions=tuple(
-            Region(room["name"], "room", rings[0], 1.0, (), (), tuple(rings[1:]))
+            Region(room["name"], "room", rings[0], room["area_m2"], (), (), tuple(rings[1:]))
             for room, rings in zip(drawn["rooms"], rooms, strict=True)
         ),
         doors=tuple(

@@ -49,7 +49,7 @@ from jaxslam.simulation import floor_plans
 NAME = "topology"
 ROBOT_RADIUS = 0.2  # [m]
 GRID, MERGED = MappingSpec("grid", ROBOT_RADIUS), MappingSpec("merged")
-LARGE_ROOM = 8.0  # [m^2] The log with the most rooms as large as this is drawn.
+LEAST_AREA = 8.0  # [m^2] The log with the most rooms as large as this is drawn.
 HALL_SPACING, PLAN_SPACING = 4.0, 1.5  # [m] between the places that a drive visits
 
 
@@ -236,7 +236,7 @@ def compute(
 
 
 def _large_rooms(drawn: Numbers) -> int:
-    return sum(room["area_m2"] >= LARGE_ROOM for room in drawn["rooms"])
+    return sum(room["area_m2"] >= LEAST_AREA for room in drawn["rooms"])
 
 
 def line_of(row: Numbers) -> str:

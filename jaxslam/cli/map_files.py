@@ -1,5 +1,6 @@
 """Files and the picture of a map."""
 
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +15,7 @@ def write_exports(
     graph: TopologicalMap,
     regions: Regions | None = None,
     planner: PlannerData | None = None,
+    arc_ids: Sequence[int] | None = None,
 ) -> None:
     """Write map.nav2.geojson, map.lif.json, map.rmf.yaml and, with networkx, map.graphml.
 
@@ -22,13 +24,14 @@ def write_exports(
         graph: The topological map.
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
+        arc_ids: Of its arcs and open ends in map.geojson; by default their indices.
     """
-    lanes = straight_lanes(graph, regions, planner)
+    lanes = straight_lanes(graph, regions, planner, arc_ids=arc_ids)
     nav2_lanes.write(out_dir / "map.nav2.geojson", graph, lanes, regions)
     lif.write(out_dir / "map.lif.json", graph, regions, planner, lanes=lanes)
     rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner, lanes=lanes)
     if find_spec("networkx") is not None:
-        graphml.write(out_dir / "map.graphml", graph, regions, planner)
+        graphml.write(out_dir / "map.graphml", graph, regions, planner, arc_ids=arc_ids)
 
 
 def draw_map(

@@ -37,7 +37,7 @@ def write_results(
     next_id: int = 0,
     regions: Regions | None = None,
     planner: PlannerData | None = None,
-) -> None:
+) -> tuple[int, ...]:
     """Write metrics.json and map.geojson to a folder.
 
     Args:
@@ -48,12 +48,16 @@ def write_results(
         next_id: As of `write_map`.
         regions: As of `write_map`.
         planner: As of `write_map`.
+
+    Returns:
+        The ids of the arcs, as of `write_map`.
     """
     path = out_dir / "map.geojson"
-    notes = write_map(path, topological_map, old, next_id, regions, planner)
+    notes, arc_ids = write_map(path, topological_map, old, next_id, regions, planner)
     if notes:
         numbers["mended"] = [*numbers.get("mended", ()), *notes]
     write_json(out_dir / "metrics.json", numbers)
+    return arc_ids
 
 
 def write_maps(
@@ -67,6 +71,7 @@ def write_maps(
     saved_map: SavedMap | None = None,
     regions: Regions | None = None,
     planner: PlannerData | None = None,
+    arc_ids: Sequence[int] | None = None,
 ) -> None:
     """Write map.yaml, map.pgm, graph.g2o, map.npz and the files of `map_files.write_exports`.
 
@@ -81,6 +86,7 @@ def write_maps(
         saved_map: The map that the run went on in, if any.
         regions: Rooms and doors of the map.
         planner: Where its nodes and arcs lie.
+        arc_ids: Of its arcs and open ends in map.geojson; by default their indices.
     """
     poses = result.poses[result.keyframes]
     kept = to_saved_map(config, params, result, times, scans, saved_map)
@@ -97,7 +103,7 @@ def write_maps(
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
     map_file.write(out_dir / map_file.NAME, kept)
-    map_files.write_exports(out_dir, result.topological_map, regions, planner)
+    map_files.write_exports(out_dir, result.topological_map, regions, planner, arc_ids)
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:
@@ -122,7 +128,7 @@ def write_map(
     next_id: int = 0,
     regions: Regions | None = None,
     planner: PlannerData | None = None,
-) -> tuple[str, ...]:
+) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Write a topological map as GeoJSON.
 
     Args:
@@ -135,15 +141,16 @@ def write_map(
         planner: Where its nodes and arcs lie.
 
     Returns:
-        Notes on what of `old` could not be kept as it was.
+        Notes on what of `old` could not be kept as it was, and the ids of the arcs, those to open
+        ends last.
     """
     nodes, arcs = route_graph(graph, regions, planner)
     if old is None:
         geojson.write(path, nodes, arcs, next_id=next_id)
-        return ()
+        return (), tuple(arc.id for arc in arcs)
     kept = carry_over(old._replace(next_id=max(old.next_id, next_id)), nodes, arcs)
     geojson.write(path, kept.nodes, kept.arcs, features=kept.features, members=kept.members)
-    return kept.notes
+    return kept.notes, tuple(arc.id for arc in kept.arcs)
 
 
 def draw(

@@ -135,7 +135,7 @@ def write(
     rooms = room_results.write_rooms_of(out_dir, occupancy, earlier, robot_radius=radius)
     planner = planner_data(graph, occupancy, rooms)
     numbers |= {"rooms": len(rooms.regions), "doors": len(rooms.doors)}
-    report.write_results(out_dir, numbers, graph, old, next_id, rooms, planner)
+    arc_ids = report.write_results(out_dir, numbers, graph, old, next_id, rooms, planner)
     map_files.draw_map(out_dir / "map.png", occupancy, graph, rooms)
     measurements = Measurement(
         jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
@@ -156,6 +156,7 @@ def write(
         saved,
         rooms,
         planner,
+        arc_ids,
     )
     bounds = [(warning.first_scan, warning.last_scan) for warning in consistency.warnings]
     report.draw(

@@ -80,12 +80,15 @@ class PlannerData(NamedTuple):
         arc_doors: Indices of the doors that each arc passes through, in its direction.
         arc_widths: A arrays (n,) [m] distance to the nearest obstacle at places of the arc, evenly
             from its first end to its last, its width profile; NaN where it is not known.
+        frontier_doors: Indices of the doors between each open end and its node, in that direction;
+            empty where that was not looked at.
     """
 
     node_region: np.ndarray
     arc_region: np.ndarray
     arc_doors: tuple[tuple[int, ...], ...]
     arc_widths: tuple[np.ndarray, ...]
+    frontier_doors: tuple[tuple[int, ...], ...] = ()
 
 
 def signed_area(ring: np.ndarray) -> float:

@@ -82,12 +82,13 @@ def carry_over(old: AnnotatedMap, nodes: Sequence[Node], arcs: Sequence[Arc]) ->
         if arc.id not in found and any(_is_annotated(edge.properties) for edge in arc.edges)
     ]
     half = [match.arc.id for match in matches if match is not None and None in match.edges]
+    gone_half = [arc.id for arc in old.arcs if arc.id not in found and len(arc.edges) == 1]
     return CarriedOver(
         nodes=kept_nodes,
         arcs=tuple(kept_arcs),
         features=features,
         members=_members(old, next(fresh_arc), next(fresh_id), kept_nodes, kept_arcs, features),
-        notes=_notes(gone_nodes, gone_arcs, half, renumbered, lost_ends),
+        notes=_notes(gone_nodes, gone_arcs, half, gone_half, renumbered, lost_ends),
     )
 
 
@@ -241,6 +242,7 @@ def _notes(
     gone_nodes: Sequence[int],
     gone_arcs: Sequence[int],
     half: Sequence[int],
+    gone_half: Sequence[int],
     renumbered: Mapping[int, int],
     lost_ends: Sequence[str],
 ) -> tuple[str, ...]:
@@ -257,6 +259,11 @@ def _notes(
         notes.append(
             f"map.geojson: arcs {_listed(half)} had one direction only and have two again; "
             "close one by a property of your own"
+        )
+    if gone_half:
+        notes.append(
+            f"map.geojson: arcs {_listed(gone_half)}, of one direction only, are gone; those in "
+            "their place have two"
         )
     if renumbered:
         pairs = [f"{before} is now {after}" for before, after in renumbered.items()]

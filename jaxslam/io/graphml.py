@@ -6,7 +6,7 @@ the same for all readers.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from os import PathLike
 from typing import Any
@@ -33,6 +33,8 @@ def write(
     graph: TopologicalMap,
     regions: Regions | None = None,
     planner: PlannerData | None = None,
+    *,
+    arc_ids: Sequence[int] | None = None,
 ) -> None:
     """Write a map as an undirected multigraph.
 
@@ -48,6 +50,7 @@ def write(
         graph: The map.
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
+        arc_ids: Of the arcs and open ends; by default their indices.
 
     Raises:
         ValueError: A field of the map is not numbers of its shape, an arc ends at no node, or
@@ -64,13 +67,14 @@ def write(
         attributes: dict[str, Any] = {"name": str(node.id), "kind": node.kind}
         attributes |= {"x": node.x, "y": node.y} | _finite({"clearance": node.clearance})
         multigraph.add_nodes_from([(node.id, attributes | dict(node.metadata))])
-    for arc in arcs:
-        attributes = {"arc": arc.id, "start": str(arc.start), "end": str(arc.end)}
+    for index, arc in enumerate(arcs):
+        arc_id = arc.id if arc_ids is None else int(arc_ids[index])
+        attributes = {"arc": arc_id, "start": str(arc.start), "end": str(arc.end)}
         attributes |= {"line": _well_known_text(np.asarray(arc.points, np.float64))}
         attributes |= _finite({"length": arc.length, "clearance": arc.clearance})
-        if planner is not None and arc.id < len(planner.arc_widths):
-            attributes["widths"] = ",".join(f"{width:.3f}" for width in planner.arc_widths[arc.id])
-        multigraph.add_edges_from([(arc.start, arc.end, arc.id, attributes | dict(arc.metadata))])
+        if planner is not None and index < len(planner.arc_widths):
+            attributes["widths"] = ",".join(f"{width:.3f}" for width in planner.arc_widths[index])
+        multigraph.add_edges_from([(arc.start, arc.end, arc_id, attributes | dict(arc.metadata))])
     write_text(path, "\n".join(networkx.generate_graphml(multigraph)) + "\n")
 
 

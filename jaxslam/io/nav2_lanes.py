@@ -3,7 +3,7 @@
 nav2_route leads a robot straight from node to node: the polylines of `map.geojson` are not driven.
 Here the points of `straight_lanes` are nodes, so that no edge is farther than a tolerance from its
 arc. The map's nodes keep their ids, `metadata.map_arc` is the arc of the map, and a door is opened
-by the short edge that passes through it.
+by the short edges up to 1 m before and behind it.
 """
 
 from os import PathLike

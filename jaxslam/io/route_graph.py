@@ -1,5 +1,7 @@
 """A topological map as nodes and arcs of `geojson`, with regions, doors and open ends."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxslam.core.maps import TopologicalMap
@@ -7,7 +9,13 @@ from jaxslam.core.regions import PlannerData, Regions
 from jaxslam.core.types import JUNCTION
 from jaxslam.io.geojson import FRONTIER, KINDS, Arc, Node
 from jaxslam.io.nav2_metadata import door_operations, edge_metadata, node_metadata
-from jaxslam.io.route_labels import Label, arc_clearances, labels, speed_fraction
+from jaxslam.io.route_labels import (
+    Label,
+    arc_clearances,
+    frontier_labels,
+    labels,
+    speed_fraction,
+)
 
 FILLED = {"filled": True}
 """Metadata of an arc through open space, which is no branch of the Voronoi diagram."""
@@ -59,19 +67,34 @@ def route_graph(
         )
         arcs.append(arc)
     if len(graph.frontier_id):
-        more_nodes, more_arcs = _open_ends(graph)
+        of_ends = frontier_labels(graph, regions, planner)
+        more_nodes, more_arcs = _open_ends(graph, of_ends, with_operations)
         return nodes + more_nodes, arcs + more_arcs
     return nodes, arcs
 
 
-def _open_ends(graph: TopologicalMap) -> tuple[list[Node], list[Arc]]:
+def _open_ends(
+    graph: TopologicalMap, of_ends: Sequence[Label], with_operations: bool
+) -> tuple[list[Node], list[Arc]]:
     """The nodes and arcs of open ends."""
     nodes, arcs = [], []
-    rows = zip(graph.frontier_id, graph.frontier_node, graph.frontiers, strict=True)
-    for index, (frontier, node, line) in enumerate(rows, start=len(graph.arc_ends)):
+    rows = zip(graph.frontier_id, graph.frontier_node, graph.frontiers, of_ends, strict=True)
+    for index, (frontier, node, line, label) in enumerate(rows, start=len(graph.arc_ends)):
         x, y = np.asarray(line, np.float64)[-1]
         nodes.append(Node(int(frontier), float(x), float(y), FRONTIER, np.nan))
         length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-        start, own = int(graph.id[node]), edge_metadata(Label(), speed_fraction(np.nan))
-        arcs.append(Arc(index, start, int(frontier), length, np.nan, line, metadata=own))
+        start, own = int(graph.id[node]), edge_metadata(label, speed_fraction(np.nan))
+        opened = door_operations(label) if with_operations else {}
+        arcs.append(
+            Arc(
+                index,
+                start,
+                int(frontier),
+                length,
+                np.nan,
+                line,
+                metadata=own,
+                operations=opened,
+            )
+        )
     return nodes, arcs

@@ -75,13 +75,37 @@ def labels(
         range(len(regions.doors))
     ):
         raise ValueError(f"arc_doors has an index of none of {len(regions.doors)} doors")
-    arcs = []
-    for index, doors in zip(planner.arc_region, planner.arc_doors, strict=True):
-        label = _of_region(regions, int(index))
-        passed = [regions.doors[door] for door in doors]
-        names, leaves = tuple(d.name for d in passed), tuple(d.name for d in passed if has_leaf(d))
-        arcs.append(label._replace(kind=DOOR, doors=names, leaves=leaves) if names else label)
-    return tuple(_of_region(regions, int(k)) for k in planner.node_region), tuple(arcs)
+    arcs = tuple(
+        _with_doors(_of_region(regions, int(index)), [regions.doors[door] for door in doors])
+        for index, doors in zip(planner.arc_region, planner.arc_doors, strict=True)
+    )
+    return tuple(_of_region(regions, int(k)) for k in planner.node_region), arcs
+
+
+def frontier_labels(
+    graph: TopologicalMap, regions: Regions | None = None, planner: PlannerData | None = None
+) -> tuple[Label, ...]:
+    """Labels of the edges to the open ends of a map: their doors, where these are known.
+
+    Raises:
+        ValueError: `planner` is of another number of open ends.
+    """
+    count = len(graph.frontiers)
+    if regions is None or planner is None or not planner.frontier_doors:
+        return count * (Label(),)
+    if len(planner.frontier_doors) != count:
+        raise ValueError(f"frontier_doors has {len(planner.frontier_doors)} entries of {count}")
+    return tuple(
+        _with_doors(Label(), [regions.doors[door] for door in doors])
+        for doors in planner.frontier_doors
+    )
+
+
+def _with_doors(label: Label, doors: list[Door]) -> Label:
+    """A label of an arc that passes through doors, if there are any."""
+    names = tuple(door.name for door in doors)
+    leaves = tuple(door.name for door in doors if has_leaf(door))
+    return label._replace(kind=DOOR, doors=names, leaves=leaves) if names else label
 
 
 def arc_clearances(graph: TopologicalMap, planner: PlannerData | None = None) -> np.ndarray:

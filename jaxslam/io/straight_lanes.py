@@ -5,7 +5,7 @@ tolerance from the arc. Before and behind a door points are added too: a lane th
 short. Corners, at walls and without arcs, and open ends are no points.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ class Lane(NamedTuple):
     Attributes:
         start: Index of a point.
         end: Index of a point.
-        arc: Index of its arc.
+        arc: Id of its arc.
         number: Lanes of the arc before it.
         door: Name of the door that it passes through, empty for none.
         label: Of the arc.
@@ -65,6 +65,7 @@ def straight_lanes(
     planner: PlannerData | None = None,
     *,
     tolerance: float = TOLERANCE,
+    arc_ids: Sequence[int] | None = None,
 ) -> StraightLanes:
     """Points and straight lanes of a map.
 
@@ -73,6 +74,7 @@ def straight_lanes(
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
         tolerance: [m] largest distance of a lane from its arc.
+        arc_ids: Of the arcs; by default their indices.
 
     Raises:
         ValueError: `planner` is of another map, a line is no polyline, or a number is not finite.
@@ -88,6 +90,7 @@ def straight_lanes(
     index = np.cumsum(drivable) - 1
     lanes: list[Lane] = []
     for arc, (start, end) in enumerate(ends.tolist()):
+        arc_id = arc if arc_ids is None else int(arc_ids[arc])
         line = as_float64(f"arc_lines[{arc}]", graph.arc_lines[arc], ("n", 2)).copy()
         line[0], line[-1] = xy[start], xy[end]
         numbers = () if regions is None or planner is None else planner.arc_doors[arc]
@@ -97,13 +100,13 @@ def straight_lanes(
         if len(line) == 2 and start == end:
             continue  # a loop within the tolerance
         more = range(len(points), len(points) + len(line) - 2)
-        names += [f"arc{arc}_{k}" for k in range(1, len(line) - 1)]
+        names += [f"arc{arc_id}_{k}" for k in range(1, len(line) - 1)]
         points += list(line[1:-1])
         point_labels += (len(line) - 2) * [Label()]
         stops = [int(index[start]), *more, int(index[end])]
         speed = speed_fraction(float(clearances[arc]))
         lanes += [
-            Lane(stops[k], stops[k + 1], arc, k, door, of_arcs[arc], speed)
+            Lane(stops[k], stops[k + 1], arc_id, k, door, of_arcs[arc], speed)
             for k, door in enumerate(doors)
         ]
     positions = np.reshape(points, (-1, 2))

@@ -17,7 +17,7 @@ Where the diagram is dense, in corridors and rooms, neither is needed, and nothi
 """
 
 import numpy as np
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
@@ -76,6 +76,14 @@ class FreeSpace:
         along = self.at(start + share * (end - start))
         needed = min(COMFORT, max(self.robot_radius, min(along[0], along[-1])))
         return bool(along.min() >= needed)
+
+    def is_free(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Whether straight lines between points (N, 2) [m] and others are free: (N,) bool."""
+        longest = float(np.hypot(*(end - start).T).max(initial=0.0))
+        share = np.linspace(0.0, 1.0, int(2.0 * longest / self.resolution) + 2)[:, None]
+        along = start[:, None] + share * (end - start)[:, None]
+        clear: np.ndarray = self.at(along.reshape(-1, 2)).reshape(along.shape[:2]) > 0.0
+        return np.asarray(clear.all(axis=1))
 
     def straightened(self, line: np.ndarray) -> np.ndarray:
         """A path (n, 2) [m] of as few of its points as see each other in turn."""
@@ -162,7 +170,7 @@ class Approach:
 
         Returns:
             The node, and the path (n, 2) [m] from it to the point; one point if that is the node.
-            None if there is no path.
+            None if there is no path, or it is not free.
         """
         square = int(self._squares(point[None])[0])
         if not np.isfinite(self.length[square]):
@@ -170,10 +178,16 @@ class Approach:
         path = [square]
         while self._before[path[-1]] >= 0:
             path.append(int(self._before[path[-1]]))
-        root = self._graph.node_on(self.centres[path[-1]])
-        line = np.vstack([point, self.centres[path[1:-1]], self._graph.xy[root]])
-        line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 0.0])]
-        return root, self._space.straightened(line)[::-1]
+        arc, _, along = self._graph.nearest(self.centres[path[-1]])
+        start = points_along(self._graph.arcs[arc].points, np.array([along]))[0]
+        for middle in path[1:-1], path:
+            line = np.vstack([point, self.centres[middle], start])
+            if self._space.is_free(line[:-1], line[1:]).all():
+                root = self._graph.split(arc, along)
+                line = np.vstack([line[:-1], self._graph.xy[root]])
+                line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 0.0])]
+                return root, self._space.straightened(line)[::-1]
+        return None
 
 
 def _add_spurs(graph: PlaneGraph, space: FreeSpace) -> None:
@@ -183,18 +197,21 @@ def _add_spurs(graph: PlaneGraph, space: FreeSpace) -> None:
         far = np.flatnonzero(np.isfinite(approach.length) & (approach.length > COVER))
         if not len(far):
             return
-        far = far[np.argsort(-approach.length[far], kind="stable")]
+        far, before = far[np.argsort(-approach.length[far], kind="stable")], len(graph.arcs)
         for end in approach.centres[far[apart(approach.centres[far], 2 * COVER)]]:
             found = approach.to(end)
             if found is not None:
                 root, line = found
                 graph.add_arc(Line(graph.add_node(end), root, line[::-1], False))
+        if len(graph.arcs) == before:
+            return
 
 
 def _blocks(space: FreeSpace, block: int) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     """Free space in squares of cells, as a graph.
 
-    A square is represented by its cell of the largest clearance.
+    A square is represented by its cell of the largest clearance. Two that touch are joined if the
+    straight line between these is free.
 
     Returns:
         Adjacency (B, B) [m] of free squares, their positions (B, 2) [m], and the number of each
@@ -221,6 +238,10 @@ def _blocks(space: FreeSpace, block: int) -> tuple[sparse.csr_array, np.ndarray,
     ]
     edges = np.concatenate(pairs)
     edges = edges[(edges >= 0).all(axis=1)]
+    narrow = ndimage.binary_dilation((cells == 0.0).any(axis=2), np.ones((3, 3)), border_value=1)
+    doubtful = np.flatnonzero(narrow[free][edges].any(axis=1))
+    ends = centres[edges[doubtful]]
+    edges = np.delete(edges, doubtful[~space.is_free(ends[:, 0], ends[:, 1])], axis=0)
     length = np.hypot(*(centres[edges[:, 0]] - centres[edges[:, 1]]).T)
     shape = (len(centres), len(centres))
     return sparse.csr_array((length, tuple(edges.T)), shape=shape), centres, index

@@ -41,13 +41,19 @@ def planner_data(
         segments = _segments(regions.doors)
         for k, (line, near) in enumerate(zip(lines, _doors_near(segments, lines), strict=True)):
             arc_doors[k] = tuple(near[door] for _, door in _crossed(segments[near], line))
+    frontier_doors: tuple[tuple[int, ...], ...] = ()
     if regions is not None:
         node_region = region_at(regions, graph.xy)
+        frontier_doors = tuple(
+            tuple(door for _, door in doors_crossed(regions.doors, line))
+            for line in graph.frontiers
+        )
     return PlannerData(
         node_region=node_region,
         arc_region=arc_region,
         arc_doors=tuple(arc_doors),
         arc_widths=tuple(widths) if lines else (),
+        frontier_doors=frontier_doors,
     )
 
 

@@ -308,9 +308,10 @@ def test_a_deleted_direction_and_an_edge_without_a_node_are_noted(path):
     edit(path, change)
     nodes = [NODES[0], NODES[2], Node(8, 4.0, 0.0, "node", 1.0)]
     found, notes = next_session(path, nodes, [arc(0, 4, 8, bow(0.0)), ARCS[2]])
-    assert len(notes) == 2
+    assert len(notes) == 3
     assert "1 nodes: ids 7 and of 1 arcs: arcs 0 are gone" in notes[0]
-    assert "your edges 901 end at nodes that are gone" in notes[1]
+    assert "arcs 1, of one direction only, are gone" in notes[1]
+    assert "your edges 901 end at nodes that are gone" in notes[2]
     assert OWN[3] in found["features"]
     geojson.write(path, NODES, ARCS)
     edit(path, change)
@@ -338,16 +339,16 @@ def test_write_map_takes_the_map_before(tmp_path):
         arc_lines=(bow(2.0), bow(-2.0)),
     )
     path = tmp_path / "map.geojson"
-    assert report.write_map(path, graph) == ()
+    assert report.write_map(path, graph)[0] == ()
     first = path.read_bytes()
-    assert report.write_map(path, graph, annotated_map.read(path)) == ()
+    assert report.write_map(path, graph, annotated_map.read(path))[0] == ()
     assert path.read_bytes() == first
     edit(path, lambda content: content["features"][0]["properties"].update(name="hall"))
     edit(path, lambda content: content["features"][3]["properties"].update(name="aisle"))
     turned = graph._replace(
         arc_length=graph.arc_length[::-1], arc_lines=graph.arc_lines[::-1], arc_ends=ends
     )
-    assert report.write_map(path, turned, annotated_map.read(path)) == ()
+    assert report.write_map(path, turned, annotated_map.read(path))[0] == ()
     names = {f["properties"]["id"]: f["properties"].get("name") for f in features_of(path)}
     assert names == {4: "hall", 7: None, 9: None, 10: "aisle", 11: None, 12: None, 13: None}
     without = graph._replace(
@@ -356,7 +357,7 @@ def test_write_map_takes_the_map_before(tmp_path):
         arc_clearance=graph.arc_clearance[:0],
         arc_lines=(),
     )
-    (note,) = report.write_map(path, without, annotated_map.read(path))
+    (note,), _ = report.write_map(path, without, annotated_map.read(path))
     assert "annotations of 0 nodes and of 1 arcs: arcs 0 are gone" in note
 
 

@@ -36,6 +36,16 @@ def test_straight_edges_lie_along_the_arcs(tmp_path):
     np.testing.assert_allclose(length, [polylines.length(x) for x in graph.arc_lines], rtol=0.01)
 
 
+def test_lanes_name_the_arcs_of_the_map(tmp_path):
+    lanes = straight_lanes(building(), arc_ids=[40, 7, 9, 12, 30])
+    nav2_lanes.write(tmp_path / "lanes.geojson", building(), lanes)
+    _, edges = nav2_graph(json.loads((tmp_path / "lanes.geojson").read_text()))
+    assert {edge["metadata"]["map_arc"] for edge in edges.values()} == {40, 7, 9, 12}
+    assert {name.split("_")[0] for name in lanes.names if name.startswith("arc")} <= {
+        f"arc{k}" for k in (40, 7, 9, 12)
+    }
+
+
 def test_a_door_is_opened_by_short_edges_alone(tmp_path):
     _, edges = nav2_graph(written(tmp_path / "lanes.geojson"))
     opened = {}

@@ -18,7 +18,7 @@ from jaxslam.io.route_graph import route_graph
 def written(path, graph=None, with_regions=True, old=None):
     """Content of a file that `write_map` writes, and its notes."""
     more = {"regions": regions(), "planner": planner()} if with_regions else {}
-    notes = report.write_map(path, building() if graph is None else graph, old, **more)
+    notes, _ = report.write_map(path, building() if graph is None else graph, old, **more)
     return json.loads(path.read_text()), notes
 
 
@@ -106,6 +106,18 @@ def test_what_is_ours_changes_with_the_map_and_no_user_is_asked(tmp_path):
     left = [*nodes.values(), *edges.values()]
     assert not any({"region", "class", "door"} & set(p["metadata"]) for p in left)
     assert not any(p.get("operations") for p in left)
+
+
+def test_a_door_before_an_open_end_is_opened(tmp_path):
+    data = planner()._replace(frontier_doors=((1,),))
+    report.write_map(tmp_path / "map.geojson", building(), None, 0, regions(), data)
+    _, edges = nav2_graph(json.loads((tmp_path / "map.geojson").read_text()))
+    ends = [edge for edge in edges.values() if 30 in (edge["startid"], edge["endid"])]
+    assert len(ends) == 2
+    for edge in ends:
+        assert edge["metadata"]["door"] == "door_4" and "open_door_4" in edge["operations"]
+    with pytest.raises(ValueError, match="frontier_doors has 2 entries of 1"):
+        route_graph(building(), regions(), data._replace(frontier_doors=((1,), ())))
 
 
 def test_a_users_values_stay_and_an_open_end_that_was_annotated_is_noted(tmp_path):

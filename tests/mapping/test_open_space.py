@@ -93,6 +93,24 @@ def test_filled_arcs_are_free_and_meet_at_nodes_alone():
                 assert polylines.project(middle, other.points)[0].min() > 0.0
 
 
+@pytest.mark.parametrize("thick", [1, 2, 3])
+def test_no_arc_of_a_small_robot_passes_a_thin_wall(thick):
+    """Two halls of 12 m x 8 m beside each other; a door at one end of the wall between them."""
+    cell, radius = 0.05, 0.05
+    free = np.zeros((244, 330), bool)
+    free[2:242, 2:328] = True
+    free[:200, 162 : 162 + thick] = False
+    space = medial_axis.free_configurations(free, clearance=radius / cell)
+    cells, _ = grid_topology.trace_medial_axis(space, ~free, space.region == 1)
+    place = FreeSpace(space.distance * cell * (space.region == 1), cell, np.zeros(2), radius)
+    graph = grid_topology.to_plane(cells, cell, np.zeros(2))
+    fill_open_space(graph, place)
+    assert not all(line.is_branch for line in graph.arcs.values())
+    for line in graph.arcs.values():
+        dense = polylines.refine(line.points, 0.01)
+        assert free[tuple(np.floor(dense / cell).astype(int).T)].all()
+
+
 def test_corridors_and_small_rooms_need_nothing():
     free = np.zeros((200, 120), bool)
     free[10:190, 50:70] = True

@@ -66,6 +66,14 @@ def floor_cells(points):
     return (points - [x, y]) @ np.array([[c, -s], [s, c]]) / floor.RESOLUTION
 
 
+def test_open_ends_know_the_doors_before_them():
+    behind, beside = floor.at((2.5, 2.1), (2.5, 5.0)), floor.at((2.5, 2.1), (3.0, 2.1))
+    made = graph()._replace(frontiers=(behind, beside), frontier_node=np.array([0, 0]))
+    found = planner_data(made, floor.occupancy(), floor.regions())
+    assert found.frontier_doors == ((0,), ())
+    assert planner_data(made, floor.occupancy()).frontier_doors == ()
+
+
 def test_what_lies_beyond_the_map_has_no_width():
     made = straight_graph(floor.at((11.0, 2.1), (20.0, 2.1)), [(0, 1)])
     (widths,) = planner_data(made, floor.occupancy()).arc_widths

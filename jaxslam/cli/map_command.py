@@ -97,7 +97,7 @@ def map_occupancy(
         geojson.write(out_dir / "map.geojson", *route_graph(result.graph, rooms, data))
         if not overwritten:
             ros_map.write(out_dir / "map.yaml", grid)
-        map_files.write_exports(out_dir, result.graph, rooms, data)
+        map_files.write_exports(out_dir, result.graph, rooms, data, robot_radius=robot_radius)
         map_files.draw_map(out_dir / "map.png", grid, result.graph, rooms)
         bar.update()
     note = room_results.without_arcs(rooms, result.graph, data)

@@ -16,6 +16,8 @@ def write_exports(
     regions: Regions | None = None,
     planner: PlannerData | None = None,
     arc_ids: Sequence[int] | None = None,
+    *,
+    robot_radius: float = 0.0,
 ) -> None:
     """Write map.nav2.geojson, map.lif.json, map.rmf.yaml and, with networkx, map.graphml.
 
@@ -25,8 +27,9 @@ def write_exports(
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
         arc_ids: Of its arcs and open ends in map.geojson; by default their indices.
+        robot_radius: [m] that lanes keep from obstacles, as far as arcs do.
     """
-    lanes = straight_lanes(graph, regions, planner, arc_ids=arc_ids)
+    lanes = straight_lanes(graph, regions, planner, robot_radius=robot_radius, arc_ids=arc_ids)
     nav2_lanes.write(out_dir / "map.nav2.geojson", graph, lanes, regions)
     lif.write(out_dir / "map.lif.json", graph, regions, planner, lanes=lanes)
     rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner, lanes=lanes)

@@ -103,7 +103,10 @@ def write_maps(
     )
     g2o_writer.write(out_dir / "graph.g2o", graph)
     map_file.write(out_dir / map_file.NAME, kept)
-    map_files.write_exports(out_dir, result.topological_map, regions, planner, arc_ids)
+    radius = config.mapping.robot_radius
+    map_files.write_exports(
+        out_dir, result.topological_map, regions, planner, arc_ids, robot_radius=radius
+    )
 
 
 def draw_scan(path: Path, config: Config, scans: Scan, number: int) -> None:

@@ -1,8 +1,9 @@
 """A topological map as points joined by straight lanes, for fleets that know no polylines.
 
-Where an arc bends, points are added to it (Douglas-Peucker), so that no lane is farther than a
-tolerance from the arc. Before and behind a door points are added too: a lane through a door is
-short. Corners, at walls and without arcs, and open ends are no points.
+Where an arc bends, points are added to it (Douglas-Peucker), so that no lane is farther from the
+arc than a tolerance, less where the robot has less than that beside it. Before and behind a door
+points are added too: a lane through a door is short. Corners, at walls and without arcs, and open
+ends are no points.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,6 +18,7 @@ from jaxslam.core.types import JUNCTION, as_float64
 from jaxslam.io.route_labels import Label, arc_clearances, has_leaf, labels, speed_fraction
 
 TOLERANCE = 0.1  # [m] largest distance of a lane from its arc
+LEAST_TOLERANCE = 0.02  # [m] of lanes where the robot just fits
 DOOR_MARGIN = 1.0  # [m] of an arc on either side of a door that its lanes open the door for
 LEAST_LANE = 0.2  # [m] doors add no shorter lanes
 
@@ -65,6 +67,7 @@ def straight_lanes(
     planner: PlannerData | None = None,
     *,
     tolerance: float = TOLERANCE,
+    robot_radius: float = 0.0,
     arc_ids: Sequence[int] | None = None,
 ) -> StraightLanes:
     """Points and straight lanes of a map.
@@ -74,6 +77,7 @@ def straight_lanes(
         regions: Its rooms and doors.
         planner: Where its nodes and arcs lie.
         tolerance: [m] largest distance of a lane from its arc.
+        robot_radius: [m] that lanes keep from obstacles, as far as their arcs do.
         arc_ids: Of the arcs; by default their indices.
 
     Raises:
@@ -96,7 +100,9 @@ def straight_lanes(
         numbers = () if regions is None or planner is None else planner.arc_doors[arc]
         found = [] if regions is None else [regions.doors[k] for k in dict.fromkeys(numbers)]
         found = [door for door in found if has_leaf(door)]
-        line, doors = _with_doors(polylines.simplify(line, tolerance), found)
+        beside = np.fmax(LEAST_TOLERANCE, clearances[arc] - robot_radius)
+        line = polylines.simplify(line, float(min(tolerance, beside)))
+        line, doors = _with_doors(line, found)
         if len(line) == 2 and start == end:
             continue  # a loop within the tolerance
         more = range(len(points), len(points) + len(line) - 2)

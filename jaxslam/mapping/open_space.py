@@ -239,9 +239,9 @@ def _blocks(space: FreeSpace, block: int) -> tuple[sparse.csr_array, np.ndarray,
     edges = np.concatenate(pairs)
     edges = edges[(edges >= 0).all(axis=1)]
     narrow = ndimage.binary_dilation((cells == 0.0).any(axis=2), np.ones((3, 3)), border_value=1)
-    doubtful = np.flatnonzero(narrow[free][edges].any(axis=1))
-    ends = centres[edges[doubtful]]
-    edges = np.delete(edges, doubtful[~space.is_free(ends[:, 0], ends[:, 1])], axis=0)
+    unsure = np.flatnonzero(narrow[free][edges].any(axis=1))
+    ends = centres[edges[unsure]]
+    edges = np.delete(edges, unsure[~space.is_free(ends[:, 0], ends[:, 1])], axis=0)
     length = np.hypot(*(centres[edges[:, 0]] - centres[edges[:, 1]]).T)
     shape = (len(centres), len(centres))
     return sparse.csr_array((length, tuple(edges.T)), shape=shape), centres, index

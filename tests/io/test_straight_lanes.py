@@ -54,6 +54,19 @@ def test_lanes_follow_arcs_from_node_to_node():
     assert found.labels[2].region == "room_1" and found.labels[3].region == ""
 
 
+@pytest.mark.parametrize("radius, off", [(0.0, 0.1), (0.4, 0.05), (0.6, 0.02), (np.nan, 0.1)])
+def test_lanes_are_nearer_to_the_arc_where_the_robot_has_little_space(radius, off):
+    """An arc that bends by 0.09 m, and by 0.04 m, with 0.45 m to obstacles."""
+    line = np.array([[6.0, 0.0], [6.09, 2.0], [6.0, 4.0], [5.96, 6.0], [6.0, 8.0]])
+    graph = building()._replace(arc_lines=(line, *building().arc_lines[1:]))
+    unknown = np.isnan(radius)
+    graph = graph._replace(arc_clearance=np.where([unknown, 0, 0, 0], np.nan, 0.45))
+    found = straight_lanes(graph, robot_radius=0.0 if unknown else radius)
+    gap = distance(line, found.xy[along(found, 0)[0]]).max()
+    assert gap <= (0.02 if unknown else off) + 1e-3
+    assert len(along(found, 0)[1]) == {0.0: 1, 0.4: 3}.get(radius, 4)
+
+
 def test_doors_have_short_lanes_of_their_own():
     found = straight_lanes(building(), regions(), planner())
     stops, doors = along(found, 0)

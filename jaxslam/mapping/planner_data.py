@@ -4,9 +4,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.maps import OccupancyMap, TopologicalMap, check_occupancy
 from jaxslam.core.regions import Door, PlannerData, Regions, contains, outer_first
 from jaxslam.core.se2_np import inverse_transform
+from jaxslam.core.types import check_type
 from jaxslam.mapping.clearance import clearance_at, clearance_field
 
 SPACING = 0.05  # [m] between the places of an arc that are looked at, or half a cell if larger
@@ -24,9 +25,11 @@ def planner_data(
         regions: Rooms and doors in the same frame; without them there are none.
 
     Raises:
-        ValueError: An argument is of another type.
+        ValueError: An argument is of another type, or a field of `occupancy` of another type,
+            shape or range.
     """
-    check_types(graph, occupancy, regions)
+    check_types(graph, regions)
+    occupancy = check_occupancy(occupancy)
     lines = graph.arc_lines
     spacing = max(SPACING, 0.5 * occupancy.resolution)
     places = [polylines.resample(line, 2 + int(polylines.length(line) / spacing)) for line in lines]
@@ -51,17 +54,11 @@ def planner_data(
     )
 
 
-def check_types(
-    graph: TopologicalMap, occupancy: OccupancyMap | None, regions: Regions | None
-) -> None:
-    """Raise ValueError if an argument is of another type."""
-    for name, value, kind in (
-        ("topological_map", graph, TopologicalMap),
-        ("occupancy", occupancy, OccupancyMap),
-        ("regions", regions, Regions),
-    ):
-        if not isinstance(value, kind) and not (value is None and kind is not TopologicalMap):
-            raise ValueError(f"{name} is of type {type(value).__name__}, not {kind.__name__}")
+def check_types(graph: TopologicalMap, regions: Regions | None = None) -> None:
+    """Raise ValueError if a map or its regions, where there are any, are of another type."""
+    check_type("topological_map", graph, TopologicalMap)
+    if regions is not None:
+        check_type("regions", regions, Regions)
 
 
 def most_common(region: np.ndarray) -> int:

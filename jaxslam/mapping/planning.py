@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.core.maps import OccupancyMap, TopologicalMap, without_arcs
+from jaxslam.core.maps import OccupancyMap, TopologicalMap, check_occupancy, without_arcs
 from jaxslam.core.regions import Regions
-from jaxslam.core.types import check_array
+from jaxslam.core.types import as_numpy, as_size, check_array
 from jaxslam.mapping import no_route, route_ends, route_search
 from jaxslam.mapping.arc_points import arc_points
-from jaxslam.mapping.clearance import clearance_field
+from jaxslam.mapping.clearance import ClearanceField, clearance_field
 from jaxslam.mapping.free_paths import free_space
 from jaxslam.mapping.planner_data import check_types
 from jaxslam.mapping.route_legs import Leg, followed, split_into_legs, without_straight_points
@@ -72,12 +72,12 @@ def route(
             obstacle or outside of the map; there is no such region; no route leads there; or an
             argument is of another type, shape or range.
     """
-    check_types(topological_map, occupancy, regions)
-    _check_radius(robot_radius)
+    check_types(topological_map, regions)
+    robot_radius = as_size("robot_radius", robot_radius)
     if directed is not None:
-        directed = np.asarray(directed)
+        directed = as_numpy("directed", directed)
         check_array("directed", directed, (len(topological_map.arc_lines),), np.bool_)
-    field = None if occupancy is None else clearance_field(occupancy)
+    field = _field(occupancy)
     points = arc_points(topological_map, field, directed)
     ends = [("start", route_ends.checked_point("start", start))]
     where = route_ends.checked_goal(goal, points, regions, field, robot_radius)
@@ -117,17 +117,16 @@ def drivable(
             knows is left out, but of a robot of radius 0.
 
     Raises:
-        ValueError: An argument is of another type or out of range.
+        ValueError: An argument is of another type, shape or range.
     """
-    check_types(topological_map, occupancy, None)
-    _check_radius(robot_radius)
-    points = arc_points(topological_map, None if occupancy is None else clearance_field(occupancy))
+    check_types(topological_map)
+    robot_radius = as_size("robot_radius", robot_radius)
+    points = arc_points(topological_map, _field(occupancy))
     gone = np.zeros(len(topological_map.arc_lines), bool)
     gone[points.arc[~points.passable(robot_radius)]] = True
     return without_arcs(topological_map, gone)
 
 
-def _check_radius(robot_radius: float) -> None:
-    """Raise ValueError if a radius is no length."""
-    if not 0.0 <= robot_radius < np.inf:
-        raise ValueError(f"robot_radius is {robot_radius}, not a number of metres >= 0")
+def _field(occupancy: OccupancyMap | None) -> ClearanceField | None:
+    """Distances to the obstacles of an occupancy map, checked, if there is one."""
+    return None if occupancy is None else clearance_field(check_occupancy(occupancy))

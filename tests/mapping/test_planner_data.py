@@ -90,8 +90,8 @@ def test_arcs_of_coarse_maps_are_sampled_by_the_cell(monkeypatch):
     monkeypatch.setattr(
         polylines, "resample", lambda line, count: counts.append(count) or resample(line, count)
     )
-    grid = floor.occupancy()._replace(resolution=1e5 * floor.RESOLUTION)
-    coarse = graph()._replace(arc_lines=tuple(1e5 * line for line in graph().arc_lines))
+    grid = floor.occupancy()._replace(resolution=1e3 * floor.RESOLUTION)
+    coarse = graph()._replace(arc_lines=tuple(1e3 * line for line in graph().arc_lines))
     planner_data(coarse, grid, floor.regions())
     assert counts and max(counts) < 1000
 
@@ -104,6 +104,6 @@ def test_a_map_without_nodes_has_no_data():
 
 
 def test_other_types_are_refused():
-    with pytest.raises(ValueError, match="regions is of type str, not Regions"):
+    with pytest.raises(ValueError, match="regions is str, not Regions"):
         planner_data(graph(), floor.occupancy(), "rooms")
     assert isinstance(floor.regions(), Regions)

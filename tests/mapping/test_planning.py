@@ -303,9 +303,11 @@ def test_a_start_that_does_not_do_is_named(start, problem):
         ({"goal": [1.0]}, r"goal is float64 \(1,\)"),
         ({"radius": np.nan}, "robot_radius is nan, not a number of metres >= 0"),
         ({"radius": -1.0}, "robot_radius is -1.0, not a number of metres >= 0"),
+        ({"radius": None}, r"robot_radius is object \(\), not numbers"),
+        ({"radius": "a"}, r"robot_radius is <U1 \(\), not numbers"),
         ({"directed": [True]}, r"directed is bool \(1,\), not bool \(4,\)"),
-        ({"occupancy": 3}, "occupancy is of type int, not OccupancyMap"),
-        ({"regions": 3}, "regions is of type int, not Regions"),
+        ({"occupancy": 3}, "occupancy is int, not OccupancyMap"),
+        ({"regions": 3}, "regions is int, not Regions"),
     ],
 )
 def test_route_names_the_argument_that_does_not_fit(wrong, problem):
@@ -323,3 +325,15 @@ def test_a_map_without_arcs_joins_what_see_each_other_alone():
     assert route(bare, [1.0, 1.0], [3.0, 3.0], occupancy=grid).length == pytest.approx(8**0.5)
     with pytest.raises(ValueError, match="start .* inf m from the nearest arc"):
         route(bare, [1.0, 1.0], [3.0, 3.0])
+
+
+@pytest.mark.parametrize("radius", [None, "a", -0.1, np.nan, np.inf, True, [0.2]])
+def test_drivable_names_a_radius_that_is_no_length(radius):
+    with pytest.raises(ValueError, match="^robot_radius is "):
+        drivable(graph(), radius)
+
+
+def test_numbers_of_any_kind_are_taken():
+    grid = floor.occupancy()._replace(resolution=np.float32(0.1), origin=floor.ORIGIN.tolist())
+    found = planned((1.0, 5.0), (8.0, 2.0), np.float32(RADIUS), occupancy=grid)
+    assert found.length == pytest.approx(planned((1.0, 5.0), (8.0, 2.0)).length, abs=1e-3)

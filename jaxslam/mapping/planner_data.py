@@ -12,6 +12,7 @@ from jaxslam.mapping.clearance import clearance_at, clearance_field
 
 SPACING = 0.05  # [m] between the places of an arc that are looked at, or half a cell if larger
 DOOR_MARGIN = 0.1  # [m] by which a door's line is longer than its jambs are apart, at either end
+SAME_PLACE = 1e-6  # [m] between what counts as one point: a line this near to a door's reaches it
 
 
 def planner_data(
@@ -43,7 +44,8 @@ def planner_data(
         arc_region = np.array([most_common(part) for part in found])
         segments = _segments(regions.doors)
         for k, (line, near) in enumerate(zip(lines, _doors_near(segments, lines), strict=True)):
-            arc_doors[k] = tuple(near[door] for _, door in _crossed(segments[near], line))
+            crossed = dict.fromkeys(door for _, door in _crossed(segments[near], line))
+            arc_doors[k] = tuple(near[door] for door in crossed)
     if regions is not None:
         node_region = region_at(regions, graph.xy)
     return PlannerData(
@@ -84,7 +86,7 @@ def region_at(regions: Regions, points: np.ndarray) -> np.ndarray:
 
 
 def doors_crossed(doors: tuple[Door, ...], line: np.ndarray) -> list[tuple[int, int]]:
-    """Doors that a polyline (n, 2) [m, map frame] crosses, in its direction.
+    """Doors that a polyline (n, 2) [m, map frame] crosses, or begins or ends at, in its direction.
 
     Returns:
         For each, the index of the polyline's segment and that of the door.
@@ -121,9 +123,19 @@ def _crossed(segments: np.ndarray, line: np.ndarray) -> list[tuple[int, int]]:
     parallel = np.abs(cross) < 1e-12
     cross = np.where(parallel, 1.0, cross)
     s, t = _cross(low - start, high - low) / cross, _cross(low - start, step) / cross
-    segment, door = np.nonzero(~parallel & (s >= 0) & (s < 1) & (t >= 0) & (t <= 1))
-    order = np.lexsort((door, segment + s[segment, door]))
-    return [(int(segment[k]), int(door[k])) for k in order]
+    size = np.hypot(step[..., 0], step[..., 1])  # (n - 1, 1)
+    beyond = size * np.maximum(-s, s - 1.0)
+    segment, door = np.nonzero(~parallel & (beyond <= SAME_PLACE) & (t >= 0) & (t <= 1))
+    along = (np.cumsum(size) - size[:, 0])[segment] + (size * s)[segment, door]
+    last: dict[int, float] = {}
+    found = []
+    for k in np.lexsort((door, segment, along)).tolist():
+        here = int(door[k])
+        # Where two segments meet on a door's line, both of them reach it.
+        if along[k] - last.get(here, -np.inf) > 3 * SAME_PLACE:
+            found.append((int(segment[k]), here))
+        last[here] = along[k]
+    return found
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

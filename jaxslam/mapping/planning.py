@@ -19,7 +19,13 @@ from jaxslam.mapping.arc_points import arc_points
 from jaxslam.mapping.clearance import ClearanceField, clearance_field
 from jaxslam.mapping.free_paths import free_space
 from jaxslam.mapping.planner_data import check_types
-from jaxslam.mapping.route_legs import Leg, followed, split_into_legs, without_straight_points
+from jaxslam.mapping.route_legs import (
+    Leg,
+    followed,
+    narrowest,
+    split_into_legs,
+    without_straight_points,
+)
 
 
 class PlannedRoute(NamedTuple):
@@ -29,6 +35,7 @@ class PlannedRoute(NamedTuple):
         line: (n, 2) [m] polyline from start to goal.
         length: [m].
         clearance: [m] distance to the nearest obstacle at its narrowest place; NaN if not known.
+            Without an occupancy map that of its arcs, NaN if it follows none.
         arcs: Indices of the arcs that it follows, in order.
         legs: Its parts, as a person would describe them.
     """
@@ -54,7 +61,9 @@ def route(
 
     The route leads through free space to an arc, over arcs, and through free space to the goal.
     It enters and leaves arcs anywhere, where its length is least, and follows none if start and
-    goal see each other. Without an occupancy map it goes straight to the nearest arc.
+    goal see each other. Without an occupancy map it goes straight to the nearest arc and straight
+    from an arc to the goal, however near the two are: no other line is known to be free. A route
+    from a point to itself has no length.
 
     Args:
         topological_map: The map.
@@ -69,8 +78,9 @@ def route(
 
     Raises:
         ValueError: In one line: the start or goal is in a wall, in unknown space, too near to an
-            obstacle or outside of the map; there is no such region; no route leads there; or an
-            argument is of another type, shape or range.
+            obstacle or outside of the map, or, without an occupancy map, more than 5 m from all
+            arcs; there is no such region; no route leads there; or an argument is of another type,
+            shape or range.
     """
     check_types(topological_map, regions)
     robot_radius = as_size("robot_radius", robot_radius)
@@ -98,8 +108,8 @@ def route(
     return PlannedRoute(
         line=without_straight_points(line),
         length=float(np.hypot(*np.diff(line, axis=0).T).sum()),
-        clearance=float(np.min([leg.clearance for leg in legs])),
-        arcs=followed(arc),
+        clearance=narrowest(legs, field),
+        arcs=followed(np.array([k for leg in legs for k in leg.arcs], int)),
         legs=legs,
     )
 

@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.core.types import as_float64, as_numpy, as_size, check_array, check_type
+
 MAX_CELLS = 2**26  # most cells of a map
-MIN_RESOLUTION, MAX_RESOLUTION = 0.001, 100.0  # [m] of a map in a file
+MIN_RESOLUTION, MAX_RESOLUTION = 0.001, 100.0  # [m] of a map
 MAX_COORDINATE = 1e7  # [m] of any point of a map in a file
 
 
@@ -27,6 +29,35 @@ class OccupancyMap(NamedTuple):
     resolution: float
     origin: np.ndarray
     notes: tuple[str, ...] = ()
+
+
+def check_occupancy(occupancy: OccupancyMap, name: str = "occupancy") -> OccupancyMap:
+    """An occupancy map whose fields are checked, with arrays of NumPy; cells are not copied.
+
+    Args:
+        occupancy: The map; its fields may be of anything array-like.
+        name: Name of `occupancy`, for the message; empty if its fields are arguments themselves.
+
+    Raises:
+        ValueError: It is no occupancy map, `occupied` and `free` are no bools of one shape (H, W)
+            with a cell at least, `origin` is not (3,) or not finite, or `resolution` is no number
+            from `MIN_RESOLUTION` to `MAX_RESOLUTION`; the message names the field.
+    """
+    check_type(name, occupancy, OccupancyMap)
+    prefix = f"{name}." if name else ""
+    occupied = as_numpy(f"{prefix}occupied", occupancy.occupied)
+    free = as_numpy(f"{prefix}free", occupancy.free)
+    check_array(f"{prefix}occupied", occupied, ("H", "W"), np.bool_)
+    check_array(f"{prefix}free", free, occupied.shape, np.bool_)
+    if not occupied.size:
+        raise ValueError(f"{prefix}occupied is bool {occupied.shape}, without a cell")
+    resolution = as_size(
+        f"{prefix}resolution", occupancy.resolution, least=MIN_RESOLUTION, most=MAX_RESOLUTION
+    )
+    origin = as_float64(f"{prefix}origin", occupancy.origin, (3,))
+    if not np.isfinite(origin).all():
+        raise ValueError(f"{prefix}origin is {origin.tolist()}, not finite")
+    return occupancy._replace(occupied=occupied, free=free, resolution=resolution, origin=origin)
 
 
 class TopologicalMap(NamedTuple):

@@ -114,6 +114,37 @@ def as_float64(name: str, x: Any, shape: tuple[Any, ...]) -> np.ndarray:
     return x
 
 
+def as_size(
+    name: str,
+    x: Any,
+    *,
+    least: float = 0.0,
+    most: float = np.inf,
+    positive: bool = False,
+    unit: str = "metres",
+) -> float:
+    """A finite float made of one number of any kind, checked.
+
+    Args:
+        name: Name of `x`, for the message.
+        x: The number, of Python or an array without axes; bools are refused.
+        least: The least that is accepted.
+        most: The most that is accepted.
+        positive: Whether `least` itself is refused.
+        unit: What it counts, for the message.
+
+    Raises:
+        ValueError: It is no number, not finite or out of range; the message states both.
+    """
+    size = float(as_float64(name, x, ()))
+    if not least <= size <= most or np.isinf(size) or (positive and size == least):
+        number = f"a {'positive ' if positive else ''}number of {unit}"
+        limits = "" if positive else f" >= {least:g}"
+        limits = limits if np.isinf(most) else f" between {least:g} and {most:g}"
+        raise ValueError(f"{name} is {size}, not {number}{limits}")
+    return size
+
+
 def as_count(name: str, x: Any, *, least: int = 1) -> int:
     """A whole number of Python, of one of Python or NumPy; raise ValueError if it is below `least`.
 

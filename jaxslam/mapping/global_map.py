@@ -21,9 +21,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.maps import OccupancyMap, TopologicalMap, check_occupancy
 from jaxslam.core.se2_np import compose, relative, transform
-from jaxslam.core.types import CORNER, JUNCTION
+from jaxslam.core.types import CORNER, JUNCTION, as_count, as_float64, as_size, check_type
 from jaxslam.mapping import grid_topology, medial_axis
 from jaxslam.mapping.diagram_junctions import corner_junctions
 from jaxslam.mapping.landmark_nodes import kept_ids, place_landmarks
@@ -71,16 +71,33 @@ def build_global_map(
         occupancy: The grid, not turned against the map frame.
         poses: (T, 3) [m, m, rad] trajectory, map frame; NaN between two drives.
         merged: The landmarks and corners, as `topological_map.build_map` has them.
-        next_id: Id of the next node.
+        next_id: Id of the next node, >= 0.
         previous: An earlier map of the same place, its nodes moved with the poses; nodes that are
             still there keep their ids.
-        robot_radius: [m] space narrower than twice this has no arcs, but where the robot drove.
+        robot_radius: [m] >= 0; space narrower than twice this has no arcs, but where the robot
+            drove.
         with_corner_junctions: Whether junctions with a branch into a corner are nodes too, as in
             the paper; landmarks elsewhere are then none. A planner does not need them.
 
     Returns:
         The map. Where no pose lies in free space, `merged` as it is.
+
+    Raises:
+        ValueError: An argument is of another type, shape or range, a row of `poses` is neither
+            finite nor NaN, or `occupancy` is turned against the map frame.
     """
+    occupancy = check_occupancy(occupancy)
+    if occupancy.origin[2] != 0.0:
+        raise ValueError(f"occupancy.origin is turned by {occupancy.origin[2]:g} rad, not by 0")
+    poses = as_float64("poses", poses, ("T", 3))
+    fits = np.isfinite(poses).all(axis=1) | np.isnan(poses).all(axis=1)
+    if not fits.all():
+        raise ValueError(f"poses[{np.argmin(fits)}] is neither finite nor NaN")
+    check_type("merged", merged, TopologicalMap)
+    if previous is not None:
+        check_type("previous", previous, TopologicalMap)
+    next_id = as_count("next_id", next_id, least=0)
+    robot_radius = as_size("robot_radius", robot_radius)
     occupancy, driven = _with_driven_cells(occupancy, poses)
     resolution, corner = occupancy.resolution, occupancy.origin[:2]
     free = medial_axis.free_space(

@@ -9,15 +9,15 @@ Two nodes may be joined by several arcs, and a ring without a junction is one no
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import MAX_RESOLUTION, TopologicalMap
-from jaxslam.core.types import JUNCTION, as_float64, check_array
+from jaxslam.core.maps import OccupancyMap, TopologicalMap, check_occupancy
+from jaxslam.core.types import JUNCTION, as_size
 from jaxslam.mapping import medial_axis
 from jaxslam.mapping.cell_graph import CellGraph, trace_cells
 from jaxslam.mapping.cell_graph_cleanup import clean_up
@@ -68,7 +68,7 @@ def extract_topology(
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
         free: (H, W) bool; a cell that is neither is unknown.
-        resolution: [m] side of a cell, up to `MAX_RESOLUTION`.
+        resolution: [m] side of a cell, from `MIN_RESOLUTION` to `MAX_RESOLUTION` of `core.maps`.
         origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
         robot_radius: [m] The nodes keep this distance from what is not free; so do arcs, but for
             less than a cell where the simplified polyline cuts a bend. `arc_clearance` is that of
@@ -80,11 +80,12 @@ def extract_topology(
     Raises:
         ValueError: The robot fits nowhere, or an argument has another type, shape or range.
     """
-    occupied, free = np.asarray(occupied), np.asarray(free)
-    check_array("occupied", occupied, ("H", "W"), np.bool_)
-    check_array("free", free, occupied.shape, np.bool_)
-    origin = as_float64("origin", origin, (3,))
-    _check_sizes(resolution, robot_radius, min_obstacle_size, min_region_area)
+    given: Any = occupied, free, resolution, origin
+    occupied, free, resolution, origin, _ = check_occupancy(OccupancyMap(*given), name="")
+    robot_radius = as_size("robot_radius", robot_radius)
+    min_obstacle_size = as_size("min_obstacle_size", min_obstacle_size)
+    if min_region_area is not None:
+        min_region_area = as_size("min_region_area", min_region_area, unit="square metres")
     callback(STAGES[0])
     free = medial_axis.free_space(
         occupied,
@@ -101,22 +102,6 @@ def extract_topology(
     cell_graph, _ = trace_medial_axis(space, occupied, chosen, callback)
     graph = _to_map(cell_graph, space, resolution, origin)
     return GridTopology(graph, count, float(areas[:count].sum()), float(areas[count:].sum()))
-
-
-def _check_sizes(
-    resolution: float, robot_radius: float, min_obstacle_size: float, min_region_area: float | None
-) -> None:
-    """Raise ValueError if a size is out of range."""
-    if not 0.0 < resolution <= MAX_RESOLUTION:
-        problem = f"not a positive number of metres up to {MAX_RESOLUTION:g}"
-        raise ValueError(f"resolution is {resolution}, {problem}")
-    for name, size, unit in (
-        ("robot_radius", robot_radius, "metres"),
-        ("min_obstacle_size", min_obstacle_size, "metres"),
-        ("min_region_area", 0.0 if min_region_area is None else min_region_area, "square metres"),
-    ):
-        if not 0.0 <= size < np.inf:
-            raise ValueError(f"{name} is {size}, not a number of {unit} >= 0")
 
 
 def trace_medial_axis(

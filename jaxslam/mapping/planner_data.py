@@ -4,13 +4,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from jaxslam.core import polylines
-from jaxslam.core.maps import OccupancyMap, TopologicalMap
+from jaxslam.core.maps import OccupancyMap, TopologicalMap, check_occupancy
 from jaxslam.core.regions import Door, PlannerData, Regions, contains, outer_first
 from jaxslam.core.se2_np import inverse_transform
+from jaxslam.core.types import check_type
 from jaxslam.mapping.clearance import clearance_at, clearance_field
 
 SPACING = 0.05  # [m] between the places of an arc that are looked at, or half a cell if larger
 DOOR_MARGIN = 0.1  # [m] by which a door's line is longer than its jambs are apart, at either end
+SAME_PLACE = 1e-6  # [m] between what counts as one point: a line this near to a door's reaches it
 
 
 def planner_data(
@@ -24,9 +26,11 @@ def planner_data(
         regions: Rooms and doors in the same frame; without them there are none.
 
     Raises:
-        ValueError: An argument is of another type.
+        ValueError: An argument is of another type, or a field of `occupancy` of another type,
+            shape or range.
     """
-    check_types(graph, occupancy, regions)
+    check_types(graph, regions)
+    occupancy = check_occupancy(occupancy)
     lines = graph.arc_lines
     spacing = max(SPACING, 0.5 * occupancy.resolution)
     places = [polylines.resample(line, 2 + int(polylines.length(line) / spacing)) for line in lines]
@@ -40,12 +44,13 @@ def planner_data(
         arc_region = np.array([most_common(part) for part in found])
         segments = _segments(regions.doors)
         for k, (line, near) in enumerate(zip(lines, _doors_near(segments, lines), strict=True)):
-            arc_doors[k] = tuple(near[door] for _, door in _crossed(segments[near], line))
+            crossed = dict.fromkeys(door for _, door in _crossed(segments[near], line))
+            arc_doors[k] = tuple(near[door] for door in crossed)
     frontier_doors: tuple[tuple[int, ...], ...] = ()
     if regions is not None:
         node_region = region_at(regions, graph.xy)
         frontier_doors = tuple(
-            tuple(door for _, door in doors_crossed(regions.doors, line))
+            tuple(dict.fromkeys(door for _, door in doors_crossed(regions.doors, line)))
             for line in graph.frontiers
         )
     return PlannerData(
@@ -57,17 +62,11 @@ def planner_data(
     )
 
 
-def check_types(
-    graph: TopologicalMap, occupancy: OccupancyMap | None, regions: Regions | None
-) -> None:
-    """Raise ValueError if an argument is of another type."""
-    for name, value, kind in (
-        ("topological_map", graph, TopologicalMap),
-        ("occupancy", occupancy, OccupancyMap),
-        ("regions", regions, Regions),
-    ):
-        if not isinstance(value, kind) and not (value is None and kind is not TopologicalMap):
-            raise ValueError(f"{name} is of type {type(value).__name__}, not {kind.__name__}")
+def check_types(graph: TopologicalMap, regions: Regions | None = None) -> None:
+    """Raise ValueError if a map or its regions, where there are any, are of another type."""
+    check_type("topological_map", graph, TopologicalMap)
+    if regions is not None:
+        check_type("regions", regions, Regions)
 
 
 def most_common(region: np.ndarray) -> int:
@@ -93,7 +92,7 @@ def region_at(regions: Regions, points: np.ndarray) -> np.ndarray:
 
 
 def doors_crossed(doors: tuple[Door, ...], line: np.ndarray) -> list[tuple[int, int]]:
-    """Doors that a polyline (n, 2) [m, map frame] crosses, in its direction.
+    """Doors that a polyline (n, 2) [m, map frame] crosses, or begins or ends at, in its direction.
 
     Returns:
         For each, the index of the polyline's segment and that of the door.
@@ -130,9 +129,19 @@ def _crossed(segments: np.ndarray, line: np.ndarray) -> list[tuple[int, int]]:
     parallel = np.abs(cross) < 1e-12
     cross = np.where(parallel, 1.0, cross)
     s, t = _cross(low - start, high - low) / cross, _cross(low - start, step) / cross
-    segment, door = np.nonzero(~parallel & (s >= 0) & (s < 1) & (t >= 0) & (t <= 1))
-    order = np.lexsort((door, segment + s[segment, door]))
-    return [(int(segment[k]), int(door[k])) for k in order]
+    size = np.hypot(step[..., 0], step[..., 1])  # (n - 1, 1)
+    beyond = size * np.maximum(-s, s - 1.0)
+    segment, door = np.nonzero(~parallel & (beyond <= SAME_PLACE) & (t >= 0) & (t <= 1))
+    along = (np.cumsum(size) - size[:, 0])[segment] + (size * s)[segment, door]
+    last: dict[int, float] = {}
+    found = []
+    for k in np.lexsort((door, segment, along)).tolist():
+        here = int(door[k])
+        # Where two segments meet on a door's line, both of them reach it.
+        if along[k] - last.get(here, -np.inf) > 3 * SAME_PLACE:
+            found.append((int(segment[k]), here))
+        last[here] = along[k]
+    return found
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

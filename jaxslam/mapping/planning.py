@@ -11,15 +11,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.core.maps import OccupancyMap, TopologicalMap, without_arcs
+from jaxslam.core.maps import OccupancyMap, TopologicalMap, check_occupancy, without_arcs
 from jaxslam.core.regions import Regions
-from jaxslam.core.types import check_array
+from jaxslam.core.types import as_numpy, as_size, check_array
 from jaxslam.mapping import no_route, route_ends, route_search
 from jaxslam.mapping.arc_points import arc_points
-from jaxslam.mapping.clearance import clearance_field
+from jaxslam.mapping.clearance import ClearanceField, clearance_field
 from jaxslam.mapping.free_paths import free_space
 from jaxslam.mapping.planner_data import check_types
-from jaxslam.mapping.route_legs import Leg, followed, split_into_legs, without_straight_points
+from jaxslam.mapping.route_legs import (
+    Leg,
+    followed,
+    narrowest,
+    split_into_legs,
+    without_straight_points,
+)
 
 
 class PlannedRoute(NamedTuple):
@@ -29,6 +35,7 @@ class PlannedRoute(NamedTuple):
         line: (n, 2) [m] polyline from start to goal.
         length: [m].
         clearance: [m] distance to the nearest obstacle at its narrowest place; NaN if not known.
+            Without an occupancy map that of its arcs, NaN if it follows none.
         arcs: Indices of the arcs that it follows, in order.
         legs: Its parts, as a person would describe them.
     """
@@ -54,7 +61,9 @@ def route(
 
     The route leads through free space to an arc, over arcs, and through free space to the goal.
     It enters and leaves arcs anywhere, where its length is least, and follows none if start and
-    goal see each other. Without an occupancy map it goes straight to the nearest arc.
+    goal see each other. Without an occupancy map it goes straight to the nearest arc and straight
+    from an arc to the goal, however near the two are: no other line is known to be free. A route
+    from a point to itself has no length.
 
     Args:
         topological_map: The map.
@@ -69,15 +78,16 @@ def route(
 
     Raises:
         ValueError: In one line: the start or goal is in a wall, in unknown space, too near to an
-            obstacle or outside of the map; there is no such region; no route leads there; or an
-            argument is of another type, shape or range.
+            obstacle or outside of the map, or, without an occupancy map, more than 5 m from all
+            arcs; there is no such region; no route leads there; or an argument is of another type,
+            shape or range.
     """
-    check_types(topological_map, occupancy, regions)
-    _check_radius(robot_radius)
+    check_types(topological_map, regions)
+    robot_radius = as_size("robot_radius", robot_radius)
     if directed is not None:
-        directed = np.asarray(directed)
+        directed = as_numpy("directed", directed)
         check_array("directed", directed, (len(topological_map.arc_lines),), np.bool_)
-    field = None if occupancy is None else clearance_field(occupancy)
+    field = _field(occupancy)
     points = arc_points(topological_map, field, directed)
     ends = [("start", route_ends.checked_point("start", start))]
     where = route_ends.checked_goal(goal, points, regions, field, robot_radius)
@@ -98,8 +108,8 @@ def route(
     return PlannedRoute(
         line=without_straight_points(line),
         length=float(np.hypot(*np.diff(line, axis=0).T).sum()),
-        clearance=float(np.min([leg.clearance for leg in legs])),
-        arcs=followed(arc),
+        clearance=narrowest(legs, field),
+        arcs=followed(np.array([k for leg in legs for k in leg.arcs], int)),
         legs=legs,
     )
 
@@ -117,17 +127,16 @@ def drivable(
             knows is left out, but of a robot of radius 0.
 
     Raises:
-        ValueError: An argument is of another type or out of range.
+        ValueError: An argument is of another type, shape or range.
     """
-    check_types(topological_map, occupancy, None)
-    _check_radius(robot_radius)
-    points = arc_points(topological_map, None if occupancy is None else clearance_field(occupancy))
+    check_types(topological_map)
+    robot_radius = as_size("robot_radius", robot_radius)
+    points = arc_points(topological_map, _field(occupancy))
     gone = np.zeros(len(topological_map.arc_lines), bool)
     gone[points.arc[~points.passable(robot_radius)]] = True
     return without_arcs(topological_map, gone)
 
 
-def _check_radius(robot_radius: float) -> None:
-    """Raise ValueError if a radius is no length."""
-    if not 0.0 <= robot_radius < np.inf:
-        raise ValueError(f"robot_radius is {robot_radius}, not a number of metres >= 0")
+def _field(occupancy: OccupancyMap | None) -> ClearanceField | None:
+    """Distances to the obstacles of an occupancy map, checked, if there is one."""
+    return None if occupancy is None else clearance_field(check_occupancy(occupancy))

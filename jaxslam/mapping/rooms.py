@@ -8,13 +8,16 @@ The steps of `find_regions`:
     -> names, those of an earlier division where they fit (`region_names`)
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from jaxslam.core.maps import OccupancyMap, check_occupancy
 from jaxslam.core.regions import Door, Region, Regions
 from jaxslam.core.se2_np import transform
-from jaxslam.core.types import as_float64, check_array
+from jaxslam.core.types import as_size, check_type
 from jaxslam.mapping import medial_axis, region_names
 from jaxslam.mapping.doors import find_doors
 from jaxslam.mapping.gaps import Gaps, take
@@ -54,9 +57,9 @@ def find_regions(
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
         free: (H, W) bool; a cell that is neither is unknown, and bounds regions like a wall.
-        resolution: [m] side of a cell.
+        resolution: [m] side of a cell, from `MIN_RESOLUTION` to `MAX_RESOLUTION` of `core.maps`.
         origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
-        robot_radius: [m] of the robot.
+        robot_radius: [m] of the robot, more than 0.
         previous: Regions of the same place, found earlier, whose names are kept; of these, only
             names, polygons, doors and `last_numbers` matter.
 
@@ -68,13 +71,11 @@ def find_regions(
         benchmark. Mielle, Magnusson, Lilienthal (2018), A method to segment maps from different
         modalities using free space layout.
     """
-    occupied, free = np.asarray(occupied), np.asarray(free)
-    check_array("occupied", occupied, ("H", "W"), np.bool_)
-    check_array("free", free, occupied.shape, np.bool_)
-    origin = as_float64("origin", origin, (3,))
-    for name, size in (("resolution", resolution), ("robot_radius", robot_radius)):
-        if not 0.0 < size < np.inf:
-            raise ValueError(f"{name} is {size}, not a positive number of metres")
+    given: Any = occupied, free, resolution, origin
+    occupied, free, resolution, origin, _ = check_occupancy(OccupancyMap(*given), name="")
+    robot_radius = as_size("robot_radius", robot_radius, positive=True)
+    if previous is not None:
+        check_type("previous", previous, Regions)
     label = np.zeros(free.shape, np.int32)
     free = np.asarray(free & ~occupied)
     if not free.any():

@@ -132,8 +132,10 @@ def _nearest_free(space: FreeSpace, xy: np.ndarray) -> str:
 
 
 def require_near(name: str, xy: np.ndarray, points: ArcPoints) -> None:
-    """Raise ValueError if a point (2,) [m] is far from all arcs."""
+    """Raise ValueError if a point (2,) [m] is far from all arcs, or there are none."""
     on_arc = points.xy[np.unique(points.edges)]
+    if not on_arc.size:
+        raise ValueError("the map has no arcs, and without an occupancy map routes follow arcs")
     distance = np.hypot(*(on_arc - xy).T).min(initial=np.inf)
     if not distance <= MAX_STRAIGHT:
         raise ValueError(

@@ -24,6 +24,7 @@ class Leg(NamedTuple):
         line: (n, 2) [m] polyline.
         length: [m].
         clearance: [m] distance to the nearest obstacle at its narrowest place; NaN if not known.
+            Without an occupancy map that of its arcs, NaN if it follows none.
         heading: [rad] at its start.
         turn: [rad] from the leg before it, left is positive; 0 for the first.
         region: Name of the region that most of it lies in, or None.
@@ -64,9 +65,9 @@ def split_into_legs(
     """
     fine = polylines.refine(line, SPACING)
     along = polylines.cumulative_lengths(fine)
-    segment = np.searchsorted(polylines.cumulative_lengths(line), along[:-1], side="right") - 1
+    middle = 0.5 * (along[:-1] + along[1:])
+    segment = np.searchsorted(polylines.cumulative_lengths(line), middle, side="right") - 1
     arc = arc[np.minimum(segment, len(arc) - 1)]
-    clearance = _clearances(graph, fine, arc, field)
     crossed = [] if regions is None else doors_crossed(regions.doors, fine)
     doors = {at + 1: door for at, door in crossed if 0 < at + 1 < len(fine) - 1}
     region = np.full(len(fine), -1) if regions is None else region_at(regions, fine)
@@ -84,7 +85,7 @@ def split_into_legs(
             Leg(
                 line=without_straight_points(fine[first : last + 1]),
                 length=float(along[last] - along[first]),
-                clearance=float(clearance[first : last + 1].min()),
+                clearance=_clearance(graph, fine[first : last + 1], arc[first:last], field),
                 heading=heading,
                 turn=float(wrap_angle(np.array(heading - before))) if first else 0.0,
                 region=None if inside is None else inside.name,
@@ -137,17 +138,25 @@ def without_straight_points(line: np.ndarray) -> np.ndarray:
     return line[np.concatenate([[True], ~straight, [True]])] if len(line) > 2 else line
 
 
-def _clearances(
-    graph: TopologicalMap, fine: np.ndarray, arc: np.ndarray, field: ClearanceField | None
-) -> np.ndarray:
-    """Clearance (n,) [m] of points (n, 2) on a route; beyond a field that of their arcs."""
-    of_arc = np.where(arc >= 0, np.append(graph.arc_clearance, np.nan)[arc], np.nan)
-    of_arc = np.append(of_arc, of_arc[-1:])
+def narrowest(legs: tuple[Leg, ...], field: ClearanceField | None) -> float:
+    """Clearance [m] of all legs of a route, NaN if not known; without a field that of its arcs."""
+    # Without a field, straight lines to the arcs are not known to be free: arcs alone count.
+    known = [leg.clearance for leg in legs if leg.arcs or field is not None]
+    return float(np.min(known)) if known else np.nan
+
+
+def _clearance(
+    graph: TopologicalMap, points: np.ndarray, arc: np.ndarray, field: ClearanceField | None
+) -> float:
+    """Clearance [m] of points (n, 2) on a route with arcs (n - 1,), NaN if not known.
+
+    It is that of its arcs beyond a field, and without one.
+    """
     if field is None:
-        # The straight lines to the arcs are not known to be free: arcs alone count.
-        return np.where(np.append(arc, arc[-1:]) >= 0, of_arc, np.inf)
-    here = clearance_at(field, fine)
-    return np.where(np.isnan(here), of_arc, here)
+        return float(graph.arc_clearance[arc[arc >= 0]].min()) if (arc >= 0).any() else np.nan
+    of_arc = np.append(graph.arc_clearance, np.nan)[arc]
+    here = clearance_at(field, points)
+    return float(np.where(np.isnan(here), np.append(of_arc, of_arc[-1:]), here).min())
 
 
 def _with_more(cuts: list[int], more: list[int], along: np.ndarray) -> list[int]:

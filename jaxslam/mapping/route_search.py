@@ -22,6 +22,9 @@ from jaxslam.mapping.route_ends import Goal
 REACHES = (5.0, 10.0, 20.0, 40.0, 100.0)
 """[m] from start and goal within which free paths are searched, the next where one fails."""
 
+SAME_PLACE = 1e-9
+"""[m] between start and goal, at most, for a route of no length."""
+
 
 class Access(NamedTuple):
     """Free paths between the start, or the goal, and points of arcs.
@@ -55,20 +58,31 @@ def find_line(
 
     Returns:
         Polyline (n, 2) [m] and, for each of its segments, the index (n - 1,) of the arc that it
-        follows, -1 for none; or None if there is no route.
+        follows, -1 for none; or None if there is no route. Only where it follows no arc but leads
+        to a point of one and back, it has segments of no length.
     """
+    if goal.xy is not None and np.hypot(*(goal.xy - start)) <= SAME_PLACE:
+        return np.stack([start, goal.xy]), np.array([-1])
     if not is_joined(points, field, start, goal, robot_radius):
         return None
     usable = _usable(points, robot_radius)
     if field is None:
-        first = _straight(points, robot_radius, start, 1)
-        return _solve(points, robot_radius, first, _to_goal(points, robot_radius, goal))
+        points, first = _straight(points, robot_radius, start, 1)
+        if goal.xy is None:
+            last = _at_goals(points, goal)
+        else:
+            points, last = _straight(points, robot_radius, goal.xy, -1)
+        found = _solve(points, robot_radius, first, last)
+        return None if found is None else _without_stops(*found)
     space = free_space(field, points, robot_radius)
     if goal.xy is not None and is_free(space, start, goal.xy[None], 1)[0]:
         return np.stack([start, goal.xy]), np.array([-1])
     for reach in REACHES:
         first = _through_space(space, points, usable, start, goal.xy, reach, 1)
-        last = _to_goal(points, robot_radius, goal, space, reach)
+        if goal.xy is None:
+            last = _at_goals(points, goal)
+        else:
+            last = _through_space(space, points, usable, goal.xy, None, reach, -1)
         found = _solve(points, robot_radius, first, last)
         if found is not None or reach >= max(field.free.shape) * field.resolution:
             return found
@@ -90,7 +104,7 @@ def is_joined(
     if field is None:
         if not usable.size:
             return False
-        near = [_nearest_edge(points, robot_radius, xy)[0] for xy in ends]
+        near = [points.edges[_nearest_edge(points, robot_radius, xy)[0], 0] for xy in ends]
         joints = np.column_stack([near, [count, count + 1]])
     else:
         space = free_space(field, points._replace(directed=np.zeros(0, bool)), robot_radius)
@@ -110,21 +124,53 @@ def _usable(points: ArcPoints, robot_radius: float) -> np.ndarray:
     return np.unique(points.edges[points.passable(robot_radius)])
 
 
-def _straight(points: ArcPoints, robot_radius: float, xy: np.ndarray, sign: int) -> Access:
-    """The straight lines between a point (2,) [m] and the two ends of the nearest edge."""
-    nearest = _nearest_edge(points, robot_radius, xy)
-    targets = points.xy[nearest]
-    length = np.hypot(*(targets - xy).T)
-    return Access(nearest, length, lambda k: np.stack([xy, targets[k]])[::sign])
+def _straight(
+    points: ArcPoints, robot_radius: float, xy: np.ndarray, sign: int
+) -> tuple[ArcPoints, Access]:
+    """The straight line between a point (2,) [m] and the nearest edge, which is split there.
+
+    Returns:
+        The points of arcs with the nearest one as the last, and the line.
+    """
+    edge, foot = _nearest_edge(points, robot_radius, xy)
+    (a, b), new = points.edges[edge], len(points.xy)
+    kept = np.append(np.delete(np.arange(len(points.edges)), edge), [edge, edge])
+    edges = points.edges[kept]
+    edges[-2:] = [a, new], [new, b]
+    length = points.length[kept]
+    length[-2:] = np.hypot(*(points.xy[[a, b]] - foot).T)
+    split = ArcPoints(
+        xy=np.concatenate([points.xy, [foot]]),
+        edges=edges,
+        length=length,
+        width=points.width[kept],
+        arc=points.arc[kept],
+        directed=points.directed[kept],
+    )
+    distance = np.array([np.hypot(*(foot - xy))])
+    return split, Access(np.array([new]), distance, lambda _: np.stack([xy, foot])[::sign])
 
 
-def _nearest_edge(points: ArcPoints, robot_radius: float, xy: np.ndarray) -> np.ndarray:
-    """The two ends (2,) of the edge nearest to a point (2,) [m], of those wide enough."""
-    edges = points.edges[points.passable(robot_radius)]
+def _nearest_edge(points: ArcPoints, robot_radius: float, xy: np.ndarray) -> tuple[int, np.ndarray]:
+    """The edge nearest to a point (2,) [m], of those wide enough, and its point (2,) there."""
+    passable = np.flatnonzero(points.passable(robot_radius))
+    edges = points.edges[passable]
     start, step = points.xy[edges[:, 0]], points.xy[edges[:, 1]] - points.xy[edges[:, 0]]
     fraction = np.sum((xy - start) * step, axis=1) / np.maximum(np.sum(step**2, axis=1), 1e-12)
     foot = start + np.clip(fraction, 0.0, 1.0)[:, None] * step
-    return np.asarray(edges[np.argmin(np.hypot(*(foot - xy).T))])
+    nearest = int(np.argmin(np.hypot(*(foot - xy).T)))
+    return int(passable[nearest]), foot[nearest]
+
+
+def _without_stops(line: np.ndarray, arc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A route (n, 2) [m] and its arcs (n - 1,) without segments of no length.
+
+    They stay where no arc is left without them.
+    """
+    moves = np.hypot(*np.diff(line, axis=0).T) > SAME_PLACE
+    if not (arc[moves] >= 0).any():
+        return line, arc
+    return line[np.append(True, moves)], arc[moves]
 
 
 def _through_space(
@@ -145,21 +191,10 @@ def _through_space(
     return Access(indices, paths.length, lambda k: path_to(space, paths, xy, targets, k))
 
 
-def _to_goal(
-    points: ArcPoints,
-    robot_radius: float,
-    goal: Goal,
-    space: FreeSpace | None = None,
-    reach: float = np.inf,
-) -> Access:
-    """Paths from points of arcs to the goal; of no length from those that are goals."""
-    if goal.xy is None:
-        targets = points.xy[goal.points]
-        return Access(goal.points, np.zeros(len(targets)), lambda k: targets[[k]])
-    if space is None:
-        return _straight(points, robot_radius, goal.xy, -1)
-    usable = _usable(points, robot_radius)
-    return _through_space(space, points, usable, goal.xy, None, reach, -1)
+def _at_goals(points: ArcPoints, goal: Goal) -> Access:
+    """Paths of no length from the points of arcs that are goals."""
+    targets = points.xy[goal.points]
+    return Access(goal.points, np.zeros(len(targets)), lambda k: targets[[k]])
 
 
 def _solve(

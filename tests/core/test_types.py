@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.core.arguments import as_bool, as_float, check_covariance
-from jaxslam.core.types import as_float64, check_array
+from jaxslam.core.types import as_float64, as_size, check_array
 
 
 @pytest.mark.parametrize(
@@ -110,3 +110,26 @@ def test_one_bad_covariance_of_several_is_named_by_its_index():
     check_covariance("cov", jnp.diag(jnp.array([1.0, 0.0])), definite=False)
     with pytest.raises(ValueError, match=re.escape("cov[1] is not positive definite")):
         check_covariance("cov", jnp.array([good, -good]))
+
+
+@pytest.mark.parametrize(
+    "x, limits, message",
+    [
+        (-1, {}, "x is -1.0, not a number of metres >= 0"),
+        (np.inf, {}, "x is inf, not a number of metres >= 0"),
+        (np.nan, {"unit": "seconds"}, "x is nan, not a number of seconds >= 0"),
+        (0.0, {"positive": True}, "x is 0.0, not a positive number of metres"),
+        (3, {"least": 1.0, "most": 2.0}, "x is 3.0, not a number of metres between 1 and 2"),
+        (True, {}, "x is bool (), not numbers"),
+        ([1.0], {}, "x is float64 (1,), not ()"),
+    ],
+)
+def test_sizes_out_of_range_are_named(x, limits, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        as_size("x", x, **limits)
+
+
+@pytest.mark.parametrize("x", [2, np.float32(2.0), np.array(2), jnp.array(2.0)])
+def test_sizes_of_any_kind_become_floats(x):
+    size = as_size("x", x, positive=True, most=2.0)
+    assert type(size) is float and size == 2.0

@@ -201,3 +201,31 @@ def test_a_node_that_becomes_a_landmark_keeps_its_id():
     again = build_global_map(drawn(*T_SHAPE), DRIVE, known, 60, previous=before.graph).graph
     np.testing.assert_array_equal(np.sort(again.id), np.sort(before.graph.id))
     np.testing.assert_array_equal(again.xy[again.id == before.graph.id[junction]], known.xy)
+
+
+@pytest.mark.parametrize(
+    "wrong, problem",
+    [
+        ({"robot_radius": -1.0}, "robot_radius is -1.0, not a number of metres >= 0"),
+        ({"robot_radius": np.nan}, "robot_radius is nan"),
+        ({"robot_radius": None}, "robot_radius is object"),
+        ({"next_id": -5}, "next_id is -5, not a whole number of at least 0"),
+        ({"next_id": 1.5}, "next_id is 1.5, not a whole number"),
+        ({"poses": DRIVE[:, :2]}, r"poses is float64 \(18, 2\), not \(T, 3\)"),
+        ({"poses": [[1.0, 4.0, 0.0], [np.nan, 4.0, 0.0]]}, r"poses\[1\] is neither finite nor NaN"),
+        ({"poses": [[np.inf, 4.0, 0.0]]}, r"poses\[0\] is neither finite nor NaN"),
+        ({"merged": None}, "merged is NoneType, not TopologicalMap"),
+        ({"previous": 3}, "previous is int, not TopologicalMap"),
+        ({"occupancy": drawn()._replace(origin=[0, 0, 0.3])}, "occupancy.origin is turned by 0.3"),
+    ],
+)
+def test_build_global_map_names_the_argument_that_does_not_fit(wrong, problem):
+    given = {"occupancy": drawn(*T_SHAPE), "poses": DRIVE, "merged": NOTHING, "next_id": 0}
+    with pytest.raises(ValueError, match=f"^{problem}"):
+        build_global_map(**given | wrong)
+
+
+def test_lists_of_poses_are_taken_as_arrays_are():
+    want = build_global_map(drawn(*T_SHAPE), DRIVE, NOTHING, 0)
+    found = build_global_map(drawn(*T_SHAPE), DRIVE.tolist(), NOTHING, 0)
+    np.testing.assert_array_equal(found.graph.xy, want.graph.xy)

@@ -33,6 +33,39 @@ def test_doors_are_those_that_a_line_crosses_in_its_direction():
     assert doors_crossed((), line) == []
 
 
+@pytest.mark.parametrize("shift", [0.0, 1e-9, -1e-9])
+@pytest.mark.parametrize("first", [1, -1])
+@pytest.mark.parametrize("second", [1, -1])
+def test_arcs_that_meet_on_the_line_of_a_door_both_have_it(first, second, shift):
+    """The node is in door_1, the arcs are stored in either direction."""
+    ends = floor.at((2.5, 2.0), (2.5, 3.1 + shift), (2.6, 4.5))
+    pairs = [(0, 1)[::first], (1, 2)[::second]]
+    found = planner_data(straight_graph(ends, pairs), floor.occupancy(), floor.regions())
+    assert found.arc_doors == ((0,), (0,))
+
+
+@pytest.mark.parametrize("along", [1, -1])
+@pytest.mark.parametrize(
+    "points, wanted",
+    [
+        ([(2.5, 2.0), (2.5, 3.1), (2.5, 4.5)], [0]),
+        ([(2.5, 2.0), (2.5, 3.1), (2.5, 3.1), (2.5, 4.5)], [0]),
+        ([(2.5, 2.0), (2.5, 3.1), (2.5, 3.1)], [0]),
+        ([(2.5, 2.0), (2.5, 3.099)], []),
+        ([(2.5, 2.0), (2.5, 3.1), (2.6, 2.0)], [0]),
+        ([(2.5, 2.0), (2.5, 4.0), (2.6, 4.0), (2.6, 2.0)], [0, 0]),
+        ([(9.3, 3.1), (9.3, 4.5), (2.5, 4.5), (2.5, 3.1)], [1, 2, 0]),
+    ],
+)
+def test_a_door_at_a_point_of_a_line_is_crossed_once(points, wanted, along):
+    line, regions = floor.at(*points)[::along], floor.regions()
+    wanted = wanted[::along]
+    assert [door for _, door in doors_crossed(regions.doors, line)] == wanted
+    made = straight_graph(line[[0, -1]], [(0, 1)], (line,))
+    found = planner_data(made, floor.occupancy(), regions)
+    assert found.arc_doors == (tuple(dict.fromkeys(wanted)),)
+
+
 def test_planner_data_of_the_made_floor():
     made = straight_graph(
         floor.at((1.0, 2.1), (11.0, 2.1), (2.5, 5.0), (9.3, 5.0)), [(0, 1), (0, 2), (3, 2), (1, 3)]
@@ -98,8 +131,8 @@ def test_arcs_of_coarse_maps_are_sampled_by_the_cell(monkeypatch):
     monkeypatch.setattr(
         polylines, "resample", lambda line, count: counts.append(count) or resample(line, count)
     )
-    grid = floor.occupancy()._replace(resolution=1e5 * floor.RESOLUTION)
-    coarse = graph()._replace(arc_lines=tuple(1e5 * line for line in graph().arc_lines))
+    grid = floor.occupancy()._replace(resolution=1e3 * floor.RESOLUTION)
+    coarse = graph()._replace(arc_lines=tuple(1e3 * line for line in graph().arc_lines))
     planner_data(coarse, grid, floor.regions())
     assert counts and max(counts) < 1000
 
@@ -112,6 +145,6 @@ def test_a_map_without_nodes_has_no_data():
 
 
 def test_other_types_are_refused():
-    with pytest.raises(ValueError, match="regions is of type str, not Regions"):
+    with pytest.raises(ValueError, match="regions is str, not Regions"):
         planner_data(graph(), floor.occupancy(), "rooms")
     assert isinstance(floor.regions(), Regions)

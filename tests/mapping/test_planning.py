@@ -251,7 +251,8 @@ def test_a_route_to_its_start_has_no_length():
 def test_without_an_occupancy_map_it_goes_straight_to_the_nearest_arc():
     made = straight_graph(np.array([[0.0, 0.0], [10.0, 0.0]]), [(0, 1)])
     found = route(made, [2.0, 0.3], [8.0, -0.4])
-    assert found.length == pytest.approx(np.hypot(0.05, 0.3) + 5.9 + np.hypot(0.05, 0.4), abs=0.05)
+    assert found.length == pytest.approx(0.3 + 6.0 + 0.4)
+    np.testing.assert_allclose(found.line, [[2, 0.3], [2, 0], [8, 0], [8, -0.4]], atol=1e-9)
     assert found.clearance == 1.0 and found.arcs == (0,)
     with pytest.raises(ValueError, match=r"start \(2.00, 5.30\) is 5.3 m from the nearest arc"):
         route(made, [2.0, 5.3], [8.0, -0.4])
@@ -261,6 +262,68 @@ def test_without_an_occupancy_map_it_goes_straight_to_the_nearest_arc():
     with pytest.raises(ValueError, match="the width of an arc to it is not known"):
         route(unknown, [2.0, 0.3], [8.0, 0.0])
     assert np.isnan(route(unknown, [2.0, 0.3], [8.0, 0.0], robot_radius=0.0).clearance)
+
+
+@pytest.mark.parametrize("options", [{}, {"directed": [True]}, {"robot_radius": 2.0}])
+@pytest.mark.parametrize("xy", [(2.0, 0.0), (2.0, 3.0), (-3.0, 2.0), (0.0, 0.0)])
+def test_without_an_occupancy_map_a_route_to_its_start_has_no_length(xy, options):
+    made = straight_graph(np.array([[0.0, 0.0], [10.0, 0.0]]), [(0, 1)])
+    found = route(made, xy, xy, **options)
+    np.testing.assert_array_equal(found.line, [xy, xy])
+    assert found.length == 0.0 and np.isnan(found.clearance) and found.arcs == ()
+    (leg,) = found.legs
+    assert leg.length == 0.0 and np.isnan(leg.clearance) and leg.arcs == ()
+
+
+@pytest.mark.parametrize(
+    "start, goal, length",
+    [
+        ((2.0, 0.3), (2.03, -0.1), 0.3 + 0.03 + 0.1),  # on one piece of the arc
+        ((2.03, 0.0), (2.0, 0.0), 0.03),
+        ((1.91, 0.0), (2.09, 0.0), 0.18),  # on two pieces
+        ((2.09, 0.2), (1.97, 0.2), 0.12 + 0.4),
+        ((-1.0, 0.0), (0.02, 1.0), 1.0 + 0.02 + 1.0),
+    ],
+)
+def test_between_two_places_of_an_arc_a_route_follows_it(start, goal, length):
+    made = straight_graph(np.array([[0.0, 0.0], [10.0, 0.0]]), [(0, 1)], clearance=0.7)
+    found = route(made, start, goal)
+    assert found.length == pytest.approx(length)
+    assert found.clearance == 0.7 and found.arcs == (0,)
+
+
+@pytest.mark.parametrize(
+    "start, goal", [((2.0, 0.3), (2.0, -0.3)), ((-1.0, 1.0), (-1.1, 1.0)), ((0.0, 1.0), (0.0, 2.0))]
+)
+def test_of_a_route_to_an_arc_and_back_no_clearance_is_known(start, goal):
+    made = straight_graph(np.array([[0.0, 0.0], [10.0, 0.0], [5.0, 8.0]]), [(0, 1), (1, 2)])
+    made = made._replace(arc_clearance=np.array([1.0, 3.0]))
+    found = route(made, start, goal)
+    foot = [max(start[0], 0.0), 0.0]
+    assert found.length == pytest.approx(
+        sum(np.hypot(*np.subtract(x, foot)) for x in (start, goal))
+    )
+    assert np.isnan(found.clearance) and found.arcs == ()
+    assert all(np.isnan(leg.clearance) and leg.arcs == () for leg in found.legs)
+    alone = straight_graph(made.xy[:2], [(0, 1)])
+    with pytest.raises(ValueError, match="its narrowest place.* is 1.00 m .* needs 1.20 m"):
+        route(alone, start, goal, robot_radius=1.2)
+
+
+def test_without_an_occupancy_map_a_leg_has_the_clearance_of_its_own_arcs():
+    xy = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [9.0, 0.0]])
+    made = straight_graph(xy, [(0, 1), (1, 2), (1, 3)])
+    made = made._replace(arc_clearance=np.array([1.0, 0.3, 0.8]))
+    found = route(made, [1.0, 2.0], [2.0, 3.0], robot_radius=0.3)
+    np.testing.assert_allclose([leg.clearance for leg in found.legs], [np.nan, 1.0, 0.3, np.nan])
+    assert found.clearance == 0.3 and found.arcs == (0, 1)
+
+
+def test_a_goal_just_behind_on_an_arc_of_one_direction_is_refused():
+    made = straight_graph(np.array([[0.0, 0.0], [10.0, 0.0]]), [(0, 1)])
+    assert route(made, [1.01, 0.1], [1.03, 0.1], directed=[True]).arcs == (0,)
+    with pytest.raises(ValueError, match="one-way arcs lead in the other direction$"):
+        route(made, [1.03, 0.1], [1.01, 0.1], directed=[True])
 
 
 def test_the_arcs_that_a_robot_can_drive():
@@ -303,9 +366,11 @@ def test_a_start_that_does_not_do_is_named(start, problem):
         ({"goal": [1.0]}, r"goal is float64 \(1,\)"),
         ({"radius": np.nan}, "robot_radius is nan, not a number of metres >= 0"),
         ({"radius": -1.0}, "robot_radius is -1.0, not a number of metres >= 0"),
+        ({"radius": None}, r"robot_radius is object \(\), not numbers"),
+        ({"radius": "a"}, r"robot_radius is <U1 \(\), not numbers"),
         ({"directed": [True]}, r"directed is bool \(1,\), not bool \(4,\)"),
-        ({"occupancy": 3}, "occupancy is of type int, not OccupancyMap"),
-        ({"regions": 3}, "regions is of type int, not Regions"),
+        ({"occupancy": 3}, "occupancy is int, not OccupancyMap"),
+        ({"regions": 3}, "regions is int, not Regions"),
     ],
 )
 def test_route_names_the_argument_that_does_not_fit(wrong, problem):
@@ -321,5 +386,17 @@ def test_a_map_without_arcs_joins_what_see_each_other_alone():
     grid = OccupancyMap(~free, free, 0.1, np.zeros(3))
     bare = straight_graph(np.zeros((0, 2)), np.zeros((0, 2), int))
     assert route(bare, [1.0, 1.0], [3.0, 3.0], occupancy=grid).length == pytest.approx(8**0.5)
-    with pytest.raises(ValueError, match="start .* inf m from the nearest arc"):
+    with pytest.raises(ValueError, match="^the map has no arcs, and without an occupancy map"):
         route(bare, [1.0, 1.0], [3.0, 3.0])
+
+
+@pytest.mark.parametrize("radius", [None, "a", -0.1, np.nan, np.inf, True, [0.2]])
+def test_drivable_names_a_radius_that_is_no_length(radius):
+    with pytest.raises(ValueError, match="^robot_radius is "):
+        drivable(graph(), radius)
+
+
+def test_numbers_of_any_kind_are_taken():
+    grid = floor.occupancy()._replace(resolution=np.float32(0.1), origin=floor.ORIGIN.tolist())
+    found = planned((1.0, 5.0), (8.0, 2.0), np.float32(RADIUS), occupancy=grid)
+    assert found.length == pytest.approx(planned((1.0, 5.0), (8.0, 2.0)).length, abs=1e-3)

@@ -219,7 +219,7 @@ def test_free_space_up_to_the_border_of_a_picture_is_a_room():
     assert found.regions[0].area > 1.5 * found.regions[1].area
 
 
-@pytest.mark.parametrize("size", [(0, 0), (3, 7), (40, 40)])
+@pytest.mark.parametrize("size", [(1, 1), (3, 7), (40, 40)])
 def test_maps_without_a_room(size):
     for value in (True, False) if max(size) < 40 else (False,):
         free = np.full(size, value)
@@ -420,8 +420,14 @@ def test_lines_between_cells_are_connected():
     "wrong, problem",
     [
         ({"resolution": 0.0}, "resolution"),
+        ({"resolution": None}, "resolution"),
         ({"robot_radius": np.nan}, "robot_radius"),
+        ({"robot_radius": 0.0}, "robot_radius is 0.0, not a positive number of metres"),
+        ({"robot_radius": "a"}, "robot_radius"),
         ({"origin": np.zeros(2)}, "origin"),
+        ({"origin": [np.nan, 0.0, 0.0]}, "origin"),
+        ({"previous": 3}, "previous is int, not Regions"),
+        (dict.fromkeys(("occupied", "free"), np.zeros((0, 0), bool)), "occupied"),
         ({"occupied": np.zeros((3, 3), bool)}, "free"),
         ({"free": np.zeros((180, 100))}, "free"),
     ],
@@ -429,7 +435,7 @@ def test_lines_between_cells_are_connected():
 def test_arguments_that_do_not_fit(wrong, problem):
     free = two_rooms()
     given = {"occupied": ~free, "free": free, "resolution": CELL, "origin": np.zeros(3)}
-    with pytest.raises(ValueError, match=problem):
+    with pytest.raises(ValueError, match=f"^{problem}"):
         find_regions(**{**given, **wrong})
 
 

@@ -5,23 +5,38 @@ from scipy import ndimage
 
 from jaxslam.mapping.gaps import Gaps, line_cells
 
+NICHE_WIDENING = 1.25  # of a niche behind its gaps, at most
+NICHE_LENGTH = 2.0  # of a niche, at least, relative to its width
+MIN_WIDENING = 2.5  # [cells] of it, that are noise
+
 _FOUR = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
 
 def divide(
-    free: np.ndarray, distance: np.ndarray, gaps: Gaps, *, min_area: float, min_radius: float
+    free: np.ndarray,
+    distance: np.ndarray,
+    gaps: Gaps,
+    *,
+    unseen: np.ndarray,
+    min_area: float,
+    min_radius: float,
+    niche_area: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Divide free space along gaps.
 
     A part smaller than `min_area`, or without a cell `min_radius` away from all obstacles, joins
-    the neighbour behind its widest gap; it is no region if it has none.
+    the neighbour behind its widest gap; it is no region if it has none. A niche is part of its
+    neighbour: it has no other, does not go on in unseen space, is smaller than `niche_area`, long,
+    and no wider than its gaps, as the space beside a bed, or between furniture and walls.
 
     Args:
         free: (H, W) bool; its border is not free.
         distance: (H, W) [cells] to the nearest obstacle.
         gaps: K gaps.
+        unseen: (H, W) bool, cells around the map that are not known.
         min_area: [cells] of a region.
         min_radius: [cells] of the largest circle in a region.
+        niche_area: [cells] of a region with one neighbour that is no wider than its gaps.
 
     Returns:
         Label (H, W) int32 of the cells, 0 for none, others from 1 on without a break; and labels
@@ -37,6 +52,8 @@ def divide(
     area = np.bincount(part.ravel(), minlength=count + 1)
     radius = largest(distance, part, count)
     region = _merged(sides, gaps.width, area, radius, min_area, min_radius)
+    front = np.bincount(part[ndimage.binary_dilation(unseen)], minlength=count + 1)
+    region = _with_niches(region, sides, gaps.width, area, radius, front, niche_area)
     label = region[part]
     _fill_cuts(label, np.argwhere(is_cut))
     return label, region[sides]
@@ -106,6 +123,49 @@ def _merged(
     kept[0] = False
     number = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
     return number[roots]
+
+
+def _with_niches(
+    region: np.ndarray,
+    sides: np.ndarray,
+    width: np.ndarray,
+    part_area: np.ndarray,
+    part_radius: np.ndarray,
+    part_front: np.ndarray,
+    niche_area: float,
+) -> np.ndarray:
+    """Region (P + 1,) int32 of each part, as `region`, with niches as parts of their neighbours.
+
+    Args:
+        region: (P + 1,) int of each part.
+        sides: (K, 2) parts on the two sides of each gap.
+        width: (K,) [cells] of the gaps.
+        part_area: (P + 1,) [cells]
+        part_radius: (P + 1,) [cells] of the largest circle in each part.
+        part_front: (P + 1,) number of its cells beside unseen ones.
+        niche_area: [cells] of a niche, less than.
+    """
+    count = int(region.max()) + 1
+    area, front = (np.bincount(region, values, count) for values in (part_area, part_front))
+    radius = np.zeros(count)
+    np.maximum.at(radius, region, part_radius)
+    owner = np.arange(count)
+    pairs = region[sides]
+    joins = (pairs > 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+    is_long = area >= NICHE_LENGTH * (2.0 * radius) ** 2
+    small = np.flatnonzero((area < niche_area) & is_long & (np.arange(count) > 0))
+    for k in small[np.argsort(area[small], kind="stable")].tolist():
+        gaps = joins & (pairs == k).any(axis=1)
+        around = np.setdiff1d(pairs[gaps], k)
+        if len(around) != 1 or owner[around[0]] != around[0] or (owner == k).sum() > 1:
+            continue
+        narrowest = width[gaps].min()
+        widest = max(NICHE_WIDENING * narrowest, narrowest + MIN_WIDENING)
+        if 2.0 * radius[k] <= widest and front[k] < 0.5 * narrowest:
+            owner[k] = around[0]
+    kept = owner == np.arange(count)
+    number = np.where(kept, np.cumsum(kept) - 1, 0).astype(np.int32)
+    return np.asarray(number[owner[region]])
 
 
 def _fill_cuts(label: np.ndarray, cells: np.ndarray) -> None:

@@ -87,12 +87,13 @@ def find_regions(
         return region_names.named(Regions(label, (), (), resolution, origin), previous)
     (box,) = ndimage.find_objects(free.astype(np.int8))
     space, distance, nearest = _space(occupied[box], free[box], resolution)
+    around_box = tuple(slice(side.start, side.stop + 2) for side in box)  # of the padded grid
     gaps = find_doors(space, distance, nearest, resolution=resolution)
     cells, sides = divide(
         space,
         distance,
         gaps,
-        unseen=np.pad(_around(~(occupied[box] | space[1:-1, 1:-1])), 1),
+        unseen=np.pad(_around(~(occupied | free)), 1)[around_box],
         min_area=MIN_AREA / resolution**2,
         min_radius=robot_radius / resolution,
         niche_area=MIN_CLOSED_AREA / resolution**2,

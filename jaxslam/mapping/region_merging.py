@@ -1,5 +1,7 @@
 """Cells between gaps as regions; parts too small for a region join a neighbour."""
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import ndimage
 
@@ -17,7 +19,7 @@ def divide(
     distance: np.ndarray,
     gaps: Gaps,
     *,
-    unseen: np.ndarray,
+    unseen: Callable[[], np.ndarray],
     min_area: float,
     min_radius: float,
     niche_area: float,
@@ -33,7 +35,7 @@ def divide(
         free: (H, W) bool; its border is not free.
         distance: (H, W) [cells] to the nearest obstacle.
         gaps: K gaps.
-        unseen: (H, W) bool, cells around the map that are not known.
+        unseen: Gives (H, W) bool, cells around the map that are not known.
         min_area: [cells] of a region.
         min_radius: [cells] of the largest circle in a region.
         niche_area: [cells] of a region with one neighbour that is no wider than its gaps.
@@ -52,8 +54,10 @@ def divide(
     area = np.bincount(part.ravel(), minlength=count + 1)
     radius = largest(distance, part, count)
     region = _merged(sides, gaps.width, area, radius, min_area, min_radius)
-    front = np.bincount(part[ndimage.binary_dilation(unseen)], minlength=count + 1)
-    region = _with_niches(region, sides, gaps.width, area, radius, front, niche_area)
+    niches = _niches(region, sides, gaps.width, area, radius, niche_area)
+    if niches:
+        front = np.bincount(region[part[ndimage.binary_dilation(unseen())]], minlength=count + 1)
+        region = _with_niches(region, niches, front)
     label = region[part]
     _fill_cuts(label, np.argwhere(is_cut))
     return label, region[sides]
@@ -125,16 +129,15 @@ def _merged(
     return number[roots]
 
 
-def _with_niches(
+def _niches(
     region: np.ndarray,
     sides: np.ndarray,
     width: np.ndarray,
     part_area: np.ndarray,
     part_radius: np.ndarray,
-    part_front: np.ndarray,
     niche_area: float,
-) -> np.ndarray:
-    """Region (P + 1,) int32 of each part, as `region`, with niches as parts of their neighbours.
+) -> list[tuple[int, int, float]]:
+    """Regions that may be niches, small ones first: region, neighbour, width [cells] of its gap.
 
     Args:
         region: (P + 1,) int of each part.
@@ -142,28 +145,43 @@ def _with_niches(
         width: (K,) [cells] of the gaps.
         part_area: (P + 1,) [cells]
         part_radius: (P + 1,) [cells] of the largest circle in each part.
-        part_front: (P + 1,) number of its cells beside unseen ones.
         niche_area: [cells] of a niche, less than.
     """
     count = int(region.max()) + 1
-    area, front = (np.bincount(region, values, count) for values in (part_area, part_front))
-    radius = np.zeros(count)
+    area, radius = np.bincount(region, part_area, count), np.zeros(count)
     np.maximum.at(radius, region, part_radius)
-    owner = np.arange(count)
     pairs = region[sides]
     joins = (pairs > 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
     is_long = area >= NICHE_LENGTH * (2.0 * radius) ** 2
     small = np.flatnonzero((area < niche_area) & is_long & (np.arange(count) > 0))
+    found = []
     for k in small[np.argsort(area[small], kind="stable")].tolist():
         gaps = joins & (pairs == k).any(axis=1)
         around = np.setdiff1d(pairs[gaps], k)
-        if len(around) != 1 or owner[around[0]] != around[0] or (owner == k).sum() > 1:
-            continue
-        narrowest = width[gaps].min()
-        widest = max(NICHE_WIDENING * narrowest, narrowest + MIN_WIDENING)
-        if 2.0 * radius[k] <= widest and front[k] < 0.5 * narrowest:
-            owner[k] = around[0]
-    kept = owner == np.arange(count)
+        if len(around) == 1:
+            narrowest = float(width[gaps].min())
+            widest = max(NICHE_WIDENING * narrowest, narrowest + MIN_WIDENING)
+            if 2.0 * radius[k] <= widest:
+                found.append((k, int(around[0]), narrowest))
+    return found
+
+
+def _with_niches(
+    region: np.ndarray, niches: list[tuple[int, int, float]], front: np.ndarray
+) -> np.ndarray:
+    """Region (P + 1,) int32 of each part, as `region`, with niches as parts of their neighbours.
+
+    Args:
+        region: (P + 1,) int of each part.
+        niches: As of `_niches`.
+        front: Number of cells of each region beside unseen ones; half a gap is no noise.
+    """
+    owner = np.arange(int(region.max()) + 1)
+    for k, neighbour, width in niches:
+        is_alone = owner[neighbour] == neighbour and (owner == k).sum() == 1
+        if is_alone and front[k] < 0.5 * width:
+            owner[k] = neighbour
+    kept = owner == np.arange(len(owner))
     number = np.where(kept, np.cumsum(kept) - 1, 0).astype(np.int32)
     return np.asarray(number[owner[region]])
 

@@ -93,7 +93,7 @@ def find_regions(
         space,
         distance,
         gaps,
-        unseen=np.pad(_around(~(occupied | free)), 1)[around_box],
+        unseen=lambda: np.pad(_around(~(occupied | free)), 1)[around_box],
         min_area=MIN_AREA / resolution**2,
         min_radius=robot_radius / resolution,
         niche_area=MIN_CLOSED_AREA / resolution**2,
@@ -216,6 +216,8 @@ def _without_obstacles(cells: np.ndarray, others: np.ndarray, resolution: float)
     is_obstacle = np.bincount(hole.ravel(), minlength=count + 1) < OBSTACLE_SHARE * cells.sum()
     is_obstacle[hole[others]] = False
     is_obstacle[[0, part[0, 0]]] = False
+    if not is_obstacle.any():
+        return cells
     distance = ndimage.distance_transform_edt(is_obstacle[hole])
     is_obstacle &= 2.0 * largest(distance, hole, count) - 1.0 <= OBSTACLE_WIDTH / resolution + 1e-9
     return np.asarray(cells | is_obstacle[hole])

@@ -21,7 +21,7 @@ from jaxslam.core.types import as_size, check_type
 from jaxslam.mapping import medial_axis, region_names
 from jaxslam.mapping.doors import find_doors
 from jaxslam.mapping.gaps import Gaps, take
-from jaxslam.mapping.region_merging import divide
+from jaxslam.mapping.region_merging import divide, largest
 from jaxslam.mapping.region_outline import outlines
 
 FURNITURE_SIZE = 1.0  # [m] of a free-standing obstacle that divides no room
@@ -32,7 +32,10 @@ CORRIDOR_WIDTH = 4.0  # [m] of most of a corridor, at most
 WIDER_SHARE = 0.25  # of a corridor that may be wider than its length allows, less than
 OUTSIDE_SHARE = 0.5  # of the border of a grid that lies outside, more than
 HALL_AREA = 50.0  # [m^2] of a hall, at least, or
-HALL_WIDTH = 7.0  # [m] of the largest circle in it
+HALL_WIDTH = 7.0  # [m] of the largest circle in it, at least
+OBSTACLE_WIDTH = 4.0  # [m] of a free-standing obstacle, at most: a table, a shelf, a pillar
+OBSTACLE_SHARE = 0.5  # of the area of the region around it, less than
+_EIGHT = np.ones((3, 3), bool)
 
 
 def find_regions(
@@ -48,11 +51,14 @@ def find_regions(
 
     A region is free space in which the robot fits, at least `MIN_AREA` large (`MIN_CLOSED_AREA`
     without a door), whether or not the robot fits through its doors. Small free-standing obstacles
-    belong to the region around them, but not to its area. Free space along most of the border of
+    belong to the region around them, but not to its area; so does the space between large ones and
+    the walls. Free space along most of the border of
     the grid, on all four sides, is outside, no region, unless there is no other region.
 
     A corridor is long for its width, and narrow: little of it is wider than its length allows. A
-    hall is no corridor, and large or wide; all else is a room.
+    hall is no corridor, and large or wide; all else is a room. Tables, shelves and pillars that
+    stand free in a region make it neither narrower nor smaller for that; the block that a ring of
+    corridors leads around does.
 
     Args:
         occupied: (H, W) bool; i grows with x, j with y.
@@ -82,13 +88,16 @@ def find_regions(
         return region_names.named(Regions(label, (), (), resolution, origin), previous)
     (box,) = ndimage.find_objects(free.astype(np.int8))
     space, distance, nearest = _space(occupied[box], free[box], resolution)
+    around_box = tuple(slice(side.start, side.stop + 2) for side in box)  # of the padded grid
     gaps = find_doors(space, distance, nearest, resolution=resolution)
     cells, sides = divide(
         space,
         distance,
         gaps,
+        unseen=lambda: np.pad(_around(~(occupied | free)), 1)[around_box],
         min_area=MIN_AREA / resolution**2,
         min_radius=robot_radius / resolution,
+        niche_area=MIN_CLOSED_AREA / resolution**2,
     )
     kept = _has_door(cells, sides, MIN_CLOSED_AREA / resolution**2)
     label[box] = cells[1:-1, 1:-1]
@@ -98,7 +107,8 @@ def find_regions(
     corner = np.array([side.start for side in box])
     gaps = gaps._replace(feet=gaps.feet - 1 + corner, middle=gaps.middle - 1.0 + corner)
     area = np.bincount(label[free], minlength=int(number.max()) + 1)[1:] * resolution**2
-    regions = _regions(label, area, resolution, origin)
+    has_door = np.isin(np.arange(len(area) + 1), sides[_joins(sides)])
+    regions = _regions(label, area, has_door, resolution, origin)
     found = Regions(label, regions, (), resolution, origin)
     return region_names.named(_with_doors(found, gaps, sides), previous)
 
@@ -119,6 +129,21 @@ def _space(
     return space, distance - 0.5, nearest
 
 
+def _around(cells: np.ndarray) -> np.ndarray:
+    """Those of some cells (H, W) bool that are connected with the border of the grid."""
+    part, count = ndimage.label(cells)
+    is_around = np.zeros(count + 1, bool)
+    for side in (part[0], part[-1], part[:, 0], part[:, -1]):
+        is_around[side] = True
+    is_around[0] = False
+    return np.asarray(is_around[part])
+
+
+def _joins(sides: np.ndarray) -> np.ndarray:
+    """Which gaps (K,) join two regions, of labels (K, 2) on their sides."""
+    return np.asarray((sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1]))
+
+
 def _has_door(label: np.ndarray, sides: np.ndarray, min_area: float) -> np.ndarray:
     """Which labels (L + 1,) have a door, `min_area` cells without one, or are the largest; not 0.
 
@@ -132,7 +157,7 @@ def _has_door(label: np.ndarray, sides: np.ndarray, min_area: float) -> np.ndarr
     area = np.bincount(label.ravel())
     area[0] = 0
     kept = (area >= min_area) | (area == area.max())
-    kept[sides[(sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])].ravel()] = True
+    kept[sides[_joins(sides)].ravel()] = True
     kept[0] = False
     return kept
 
@@ -152,20 +177,55 @@ def _to_map(points: np.ndarray, resolution: float, origin: np.ndarray) -> np.nda
 
 
 def _regions(
-    label: np.ndarray, area: np.ndarray, resolution: float, origin: np.ndarray
+    label: np.ndarray, area: np.ndarray, has_door: np.ndarray, resolution: float, origin: np.ndarray
 ) -> tuple[Region, ...]:
-    """Regions of the labels, without names and doors; `area` [m^2] of each."""
+    """Regions of the labels, without names and doors.
+
+    Args:
+        label: (H, W) int, 0 for none.
+        area: (R,) [m^2] of each region.
+        has_door: (R + 1,) bool, whether each label has a door.
+        resolution: [m] side of a cell.
+        origin: (3,) [m, m, rad] pose of the corner of cell [0, 0] in the map frame.
+    """
     found = []
     boxes = ndimage.find_objects(label, len(area))
     for k, (box, loops) in enumerate(zip(boxes, outlines(label, len(area)), strict=True)):
-        kind = _kind(label[box] == k + 1, float(area[k]), resolution)
+        cells = label[box] == k + 1
+        cells = _without_obstacles(cells, has_door[label[box]] & ~cells, resolution)
+        kind = _kind(cells, resolution)
         polygon, *holes = (_to_map(loop, resolution, origin) for loop in loops)
         found.append(Region("", kind, polygon, float(area[k]), (), (), tuple(holes)))
     return tuple(found)
 
 
-def _kind(cells: np.ndarray, area: float, resolution: float) -> str:
-    """Kind of a region of some cells (H, W) bool, of which `area` [m^2] is free.
+def _without_obstacles(cells: np.ndarray, others: np.ndarray, resolution: float) -> np.ndarray:
+    """Cells (H, W) bool of a region, and of the obstacles that stand free in it.
+
+    These are its holes without a cell of a region that has a door, at most `OBSTACLE_WIDTH` wide,
+    less than `OBSTACLE_SHARE` as large as the region.
+
+    Args:
+        cells: (H, W) bool of the region, in its bounding box.
+        others: (H, W) bool of other regions that have a door.
+        resolution: [m] side of a cell.
+    """
+    part, count = ndimage.label(np.pad(~cells, 1, constant_values=True), structure=_EIGHT)
+    if count == 1:
+        return cells
+    hole = part[1:-1, 1:-1]
+    is_obstacle = np.bincount(hole.ravel(), minlength=count + 1) < OBSTACLE_SHARE * cells.sum()
+    is_obstacle[hole[others]] = False
+    is_obstacle[[0, part[0, 0]]] = False
+    if not is_obstacle.any():
+        return cells
+    distance = ndimage.distance_transform_edt(is_obstacle[hole])
+    is_obstacle &= 2.0 * largest(distance, hole, count) - 1.0 <= OBSTACLE_WIDTH / resolution + 1e-9
+    return np.asarray(cells | is_obstacle[hole])
+
+
+def _kind(cells: np.ndarray, resolution: float) -> str:
+    """Kind of a region of some cells (H, W) bool.
 
     A strip of the area A that is n times as long as wide has the width sqrt(A / n).
     """
@@ -175,8 +235,18 @@ def _kind(cells: np.ndarray, area: float, resolution: float) -> str:
     is_long = _share(cells, distance, most_wide) < WIDER_SHARE
     if is_long and _share(cells, distance, CORRIDOR_WIDTH / resolution) < 0.5:
         return "corridor"
-    is_wide = 2.0 * distance.max() * resolution >= HALL_WIDTH
-    return "hall" if is_wide or area >= HALL_AREA else "room"
+    is_wide = _largest_circle(distance) * resolution >= HALL_WIDTH - 1e-9
+    return "hall" if is_wide or cells.sum() * resolution**2 >= HALL_AREA - 1e-9 else "room"
+
+
+def _largest_circle(distance: np.ndarray) -> float:
+    """Width [cells] of the largest circle, around the middle of a cell or a corner of four.
+
+    Args:
+        distance: (H, W) [cells] from the middle of a cell to the nearest edge of an obstacle.
+    """
+    around_corner = ndimage.minimum_filter(distance, size=2).max() + 0.5
+    return 2.0 * float(max(distance.max(), around_corner))
 
 
 def _share(cells: np.ndarray, distance: np.ndarray, width: float) -> float:
@@ -196,7 +266,7 @@ def _share(cells: np.ndarray, distance: np.ndarray, width: float) -> float:
 
 def _with_doors(found: Regions, gaps: Gaps, sides: np.ndarray) -> Regions:
     """Regions with the gaps that join two of them as doors; `sides` (K, 2) are their labels."""
-    joins = (sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])
+    joins = _joins(sides)
     gaps, pairs = take(gaps, joins), np.sort(sides[joins] - 1, axis=1)
     ends = gaps.feet + 0.5
     ends = ends + 0.5 * gaps.along[:, None] * np.array([1.0, -1.0])[:, None]

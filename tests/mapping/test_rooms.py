@@ -408,6 +408,72 @@ def test_kinds_are_those_of_the_shape(name, cell, angle):
     assert {region.kind for region in divided(free, resolution=cell).regions} == {kind}
 
 
+def furnished(size, *boxes):
+    """Free cells of a room of a size [m] with obstacles x0, x1, y0, y1 [m] in it."""
+    free = np.ones(np.rint(np.array(size) / CELL).astype(int), bool)
+    return np.pad(free & ~carved(*boxes, shape=free.shape), 6)
+
+
+STANDING_FREE = {
+    "long table": (furnished((6.0, 6.0), (2.25, 3.75, 1.5, 4.5)), "room"),
+    "square table": (furnished((6.0, 6.0), (2.1, 3.9, 2.1, 3.9)), "room"),
+    "small table": (furnished((5.0, 6.0), (1.75, 3.25, 2.25, 3.75)), "room"),
+    "bed": (furnished((4.0, 5.0), (1.0, 3.0, 1.0, 2.6)), "room"),
+    "pillars": (
+        furnished(
+            (12.0, 20.0),
+            *((x, x + 1.2, y, y + 1.2) for x in (2, 5, 8) for y in range(2, 18, 3)),
+        ),
+        "hall",
+    ),
+    "shelves": (furnished((20.0, 30.0), *((x, x + 1, 2, 28) for x in range(3, 17, 3))), "hall"),
+    "ring": (furnished((8.0, 8.0), (1.5, 6.5, 1.5, 6.5)), "corridor"),
+    "two corridors": (furnished((7.0, 24.0), (2.0, 5.0, 2.0, 22.0)), "corridor"),
+}
+
+
+@pytest.mark.parametrize("name", STANDING_FREE)
+def test_obstacles_that_stand_free_make_no_corridor(name):
+    free, kind = STANDING_FREE[name]
+    found = divided(free)
+    assert [region.kind for region in found.regions] == [kind] and not found.doors
+    assert found.regions[0].area == pytest.approx(free.sum() * CELL**2)
+
+
+def test_a_ring_around_rooms_with_doors_is_a_corridor_around_a_closed_table_it_is_a_hall():
+    around = furnished((9.0, 9.0), (2.8, 6.2, 2.8, 6.2))
+    inside = np.pad(carved((2.9, 6.1, 2.9, 6.1), shape=(180, 180)), 6)
+    closed = divided(around | inside)
+    assert [region.kind for region in closed.regions] == ["hall", "room"] and not closed.doors
+    door = np.pad(carved((4.0, 4.9, 2.8, 2.9), shape=(180, 180)), 6)
+    opened = divided(around | inside | door)
+    assert [region.kind for region in opened.regions] == ["corridor", "room"]
+
+
+def test_space_between_furniture_and_walls_is_part_of_the_room():
+    corner = furnished((6.0, 6.0), (0.85, 2.35, 0.85, 1.85))
+    bed = furnished((4.0, 5.0), (0.0, 2.0, 0.7, 2.3))
+    for free in (corner, bed):
+        found = divided(free)
+        assert [region.kind for region in found.regions] == ["room"] and not found.doors
+
+
+def test_a_passage_into_unseen_space_is_a_region():
+    free = np.pad(two_rooms(), ((0, 60), (0, 0)))
+    free[166:210, 32:50] = True  # 2.2 x 0.9 m
+    walls = ndimage.binary_dilation(free, iterations=2) & ~free
+    assert len(divided(free, walls).regions) == 2
+    walls[210:] = False
+    assert len(divided(free, walls).regions) == 3
+
+
+@pytest.mark.parametrize(
+    "size, kind", [((7.0, 7.0), "hall"), ((7.05, 7.0), "hall"), ((6.95, 7.0), "room")]
+)
+def test_a_hall_is_seven_metres_wide_at_least(size, kind):
+    assert [region.kind for region in divided(furnished(size)).regions] == [kind]
+
+
 def test_lines_between_cells_are_connected():
     cells = line_cells(np.array([[2, 3], [9, 7]]))
     np.testing.assert_array_equal(cells[[0, -1]], [[2, 3], [9, 7]])

@@ -27,11 +27,13 @@ MIN_PAPER = 128.0
 MIN_PALE_STEP = 20.0  # between the mean shades of paper and of walls lighter than `WHITE_ABOVE`
 MAX_PALE_SHARE = 0.25  # of such walls
 MAX_VALLEY = 0.25  # of the darker group: pixels between it and the lighter one
+MIN_BLACK = 0.25  # of map_saver's walls, for each pixel of a grey that is not its unknown
+MIN_SURROUND = 0.01  # of all pixels: what is unknown around a plan
 MIN_OUTLINE = 0.25  # darker neighbours of what is unknown, for each lighter one
 SAME_SHADE, OTHER_SHADE = 1, 8  # levels apart
 MIN_PAPER_SHARE = 0.1  # of pixels lighter than a grey surround, for each pixel of it
 MAX_WALL_WIDTH = 1.0  # [m] of walls that are drawn as outlines filled with a light grey
-MIN_FILL = 16  # pixels of such a fill
+MIN_FILL = 100  # pixels of such a fill
 DARK_BORDER, MAX_LINES = 0.9, 0.25  # of an inverted plan: border that is dark, pixels that are free
 
 
@@ -111,22 +113,26 @@ def plan_shades(shade: np.ndarray, known: np.ndarray, resolution: float) -> Plan
     told = []
     unknown = np.zeros(level.shape, bool)
     surround = _surround(level)
-    if surround is not None:
-        unknown = np.abs(level - surround) <= SAME_SHADE
-        if abs(surround - UNKNOWN) > SAME_SHADE:
-            told.append(f"the shade {surround} of 255 around the plan is taken as unknown")
-    count = np.bincount(level[known & ~unknown], minlength=256)
-    limit, paper = _limit(count)
     walls = np.zeros(level.shape, bool)
+    if surround is not None:
+        unknown = (np.abs(level - surround) <= SAME_SHADE) & (level < WHITE_ABOVE)
+    count = np.bincount(level[known & ~unknown], minlength=256)
+    if surround is not None and abs(surround - UNKNOWN) <= SAME_SHADE:
+        black, grey = _black_and_grey(count)
+        if black > MIN_BLACK * grey:  # of map_saver
+            return Plan(walls, walls, None, ())  # its thresholds leave the shade unknown
+    if surround is not None:
+        told.append(f"the shade {surround} of 255 around the plan is taken as unknown")
+    limit, paper = _limit(count)
     if limit is not None:
         told.append(f"shades below {np.ceil(limit):.0f} of 255 are taken as walls")
         if paper <= WHITE_ABOVE:
-            told.append(f"paper of the shade {paper:.0f} as free")
+            told.append(f"paper of the shade {paper:.0f} is taken as free")
     if paper > WHITE_ABOVE:
         pale = (level > (limit or WHITE_ABOVE)) & (level <= paper - PAPER_STEP)
         walls = _outlined(level, pale & ~unknown, resolution)
         if walls.any():
-            told.append("narrow light grey areas within darker lines as walls")
+            told.append("narrow light grey areas within darker lines are taken as walls")
     notes = (", ".join(told),) if told else ()
     return Plan(unknown, walls, None if limit is None else limit / 255.0, notes)
 
@@ -193,11 +199,17 @@ def _limit(count: np.ndarray) -> tuple[float | None, float]:
         parted = 0.0
     is_paper = lighter.sum() >= 0.5 * total and paper >= MIN_PAPER
     limit = max(parted, min(WHITE_ABOVE, paper - PAPER_STEP if is_paper else WHITE_ABOVE))
-    black = count[levels < BLACK_BELOW].sum()
-    grey = count[(levels > BLACK_BELOW) & (levels < WHITE_ABOVE)].sum()
+    black, grey = _black_and_grey(count)
     if limit == WHITE_ABOVE and black >= grey:
         return None, paper
     return limit, paper
+
+
+def _black_and_grey(count: np.ndarray) -> tuple[int, int]:
+    """Pixels that map_saver's thresholds make occupied, and those between them."""
+    levels = np.arange(256)
+    grey = count[(levels > BLACK_BELOW) & (levels < WHITE_ABOVE)].sum()
+    return int(count[levels < BLACK_BELOW].sum()), int(grey)
 
 
 def _is_pale(count: np.ndarray, parted: float) -> bool:
@@ -225,7 +237,11 @@ def _surround(level: np.ndarray) -> int | None:
     candidate = usual if grey else UNKNOWN
     is_it = np.abs(level - candidate) <= SAME_SHADE
     lighter = (level > candidate + PAPER_STEP).sum()
-    if not is_it.any() or candidate != UNKNOWN and lighter < MIN_PAPER_SHARE * is_it.sum():
+    if (
+        is_it.mean() < MIN_SURROUND
+        or candidate != UNKNOWN
+        and lighter < MIN_PAPER_SHARE * is_it.sum()
+    ):
         return None
     around = np.zeros(2)  # darker, lighter neighbours
     for here, beside in _neighbours(level):

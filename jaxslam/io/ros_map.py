@@ -92,8 +92,8 @@ def read_picture(path: str | PathLike, resolution: float) -> OccupancyMap:
     """Read a map from a picture alone: light is free, dark occupied.
 
     The thresholds are those that map_saver writes where black walls on white paper allow it, else
-    `pictures.plan_shades` finds them and what is unknown; what it guesses is in the notes. The lower
-    left corner, of the picture as viewers turn it, is the origin.
+    `pictures.plan_shades` finds them and what is unknown; what it guesses is in the notes. The
+    lower left corner, of the picture as viewers turn it, is the origin.
 
     Args:
         path: Image of one of `pictures.FORMATS`.

@@ -110,7 +110,7 @@ def plan_shades(shade: np.ndarray, known: np.ndarray, resolution: float) -> Plan
     """
     level = np.round(255.0 * shade).astype(np.int16)
     level[~known] = -1
-    told = []
+    guesses = []
     unknown = np.zeros(level.shape, bool)
     surround = _surround(level)
     walls = np.zeros(level.shape, bool)
@@ -122,18 +122,18 @@ def plan_shades(shade: np.ndarray, known: np.ndarray, resolution: float) -> Plan
         if black > MIN_BLACK * grey:  # of map_saver
             return Plan(walls, walls, None, ())  # its thresholds leave the shade unknown
     if surround is not None:
-        told.append(f"the shade {surround} of 255 around the plan is taken as unknown")
+        guesses.append(f"the shade {surround} of 255 around the plan is taken as unknown")
     limit, paper = _limit(count)
     if limit is not None:
-        told.append(f"shades below {np.ceil(limit):.0f} of 255 are taken as walls")
+        guesses.append(f"shades below {np.ceil(limit):.0f} of 255 are taken as walls")
         if paper <= WHITE_ABOVE:
-            told.append(f"paper of the shade {paper:.0f} is taken as free")
+            guesses.append(f"paper of the shade {paper:.0f} is taken as free")
     if paper > WHITE_ABOVE:
         pale = (level > (limit or WHITE_ABOVE)) & (level <= paper - PAPER_STEP)
         walls = _outlined(level, pale & ~unknown, resolution)
         if walls.any():
-            told.append("narrow light grey areas within darker lines are taken as walls")
-    notes = (", ".join(told),) if told else ()
+            guesses.append("narrow light grey areas within darker lines are taken as walls")
+    notes = (", ".join(guesses),) if guesses else ()
     return Plan(unknown, walls, None if limit is None else limit / 255.0, notes)
 
 

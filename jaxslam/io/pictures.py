@@ -3,6 +3,7 @@
 Pillow, which matplotlib installs, decodes them.
 """
 
+import struct
 import warnings
 from os import PathLike
 from pathlib import Path
@@ -18,6 +19,9 @@ FORMATS = ("PPM", "PNG", "BMP", "JPEG", "GIF", "TIFF")  # PPM stands for all of 
 SUFFIXES = tuple(".png .pgm .pbm .ppm .pnm .bmp .jpg .jpeg .gif .tif .tiff".split())
 NAMES = "a PNG, PGM, BMP, JPEG, GIF or TIFF image"
 _WITH_ALPHA = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # modes that Pillow converts to RGBA
+
+ORIENTATION = 0x0112  # EXIF field
+_TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  # its values: `Image.Transpose`
 
 # Shades are levels from 0 (black) to 255 (white).
 UNKNOWN = 205  # that map_saver writes
@@ -71,7 +75,7 @@ def read(path: Path, *, upright: bool = False) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: It cannot be read, or has no cells or more than `MAX_CELLS`.
     """
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import Image, UnidentifiedImageError
 
     advice = f"give {NAMES}"
     try:
@@ -83,7 +87,7 @@ def read(path: Path, *, upright: bool = False) -> tuple[np.ndarray, np.ndarray]:
                 if not 0 < width * height <= MAX_CELLS:
                     problem = f"{width} x {height} cells are not between 1 and {MAX_CELLS}"
                     raise InputError(problem, path=path, advice="cut the map into parts")
-                return _pixels(ImageOps.exif_transpose(image) if upright else image)
+                return _pixels(_turned(image) if upright else image)
     except InputError:
         raise
     except FileNotFoundError:
@@ -92,7 +96,7 @@ def read(path: Path, *, upright: bool = False) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"has more than {MAX_CELLS} cells", path=path) from None
     except UnidentifiedImageError:
         raise InputError("is no image that can be read", path=path, advice=advice) from None
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
+    except (OSError, ValueError, TypeError, SyntaxError, EOFError, struct.error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"cannot be read ({reason})", path=path, advice=advice) from None
 
@@ -170,6 +174,19 @@ def looks_inverted(occupied: np.ndarray, free: np.ndarray) -> bool:
 def half_width(area: np.ndarray) -> float:
     """Half of the width [pixels] of an area (H, W) bool where it is widest."""
     return float(ndimage.distance_transform_edt(np.pad(area, 1)).max()) - 0.5
+
+
+def _turned(image: Any) -> Any:
+    """An open Pillow image as its EXIF orientation says; as it is where that cannot be read.
+
+    Not by `ImageOps.exif_transpose`, which fails where other EXIF fields cannot be written again.
+    """
+    image.load()  # turns a TIFF image
+    try:
+        method = _TURNS.get(image.getexif().get(ORIENTATION))
+    except (OSError, ValueError, TypeError, SyntaxError, struct.error):
+        return image
+    return image if method is None else image.transpose(method)
 
 
 def _pixels(image: Any) -> tuple[np.ndarray, np.ndarray]:

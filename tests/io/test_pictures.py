@@ -17,7 +17,7 @@ def plan(path, shade, **options):
 def test_every_picture_that_has_the_name_of_one_can_be_read(tmp_path, suffix):
     shade = np.full((40, 60, 3), 255)
     shade[:, :20] = 0
-    found = ros_map.read_picture(plan(tmp_path / f"a{suffix}", shade), 0.1)
+    found = ros_map.read_picture(plan(tmp_path / "a.png", shade), 0.1)
     assert pictures.is_picture(f"A{suffix.upper()}")
     assert found.occupied[:18].all() and found.free[22:].all() and not found.notes
 
@@ -194,13 +194,24 @@ def test_a_plan_that_is_inverted_is_refused_or_told(tmp_path):
     assert not read(tmp_path, two_rooms(0, ground=0))[2]  # rooms within black
 
 
-def test_a_photograph_is_turned_as_viewers_do(tmp_path):
-    """That of a YAML file is not, as in map_server."""
+@pytest.mark.parametrize("orientation", range(10))
+def test_a_photograph_is_turned_as_viewers_do(tmp_path, orientation):
     exif = Image.Exif()
-    exif[0x0112] = 6  # turn clockwise
+    exif[0x0112] = orientation
     shade = two_rooms(0)
-    shade[:10] = 0
-    plan(tmp_path / "a.png", shade, exif=exif)
-    found = ros_map.read_picture(tmp_path / "a.png", 0.1)
-    np.testing.assert_array_equal(found.free.T[::-1], np.rot90(shade, -1) == 255)
-    assert pictures.read(tmp_path / "a.png")[0].shape == shade.shape
+    shade[:10] = shade[20:30, 80:90] = 0
+    path = plan(tmp_path / f"a{suffix}", shade, exif=exif)
+    found = ros_map.read_picture(path, 0.1).free.T[::-1] == 1
+    turns = {2: shade[:, ::-1], 3: shade[::-1, ::-1], 4: shade[::-1], 5: shade.T}
+    turns |= {6: np.rot90(shade, -1), 7: shade[::-1, ::-1].T, 8: np.rot90(shade)}
+    np.testing.assert_array_equal(found, turns.get(orientation, shade) == 255)
+    assert pictures.read(path)[0].shape == shade.shape  # of a YAML file, as in map_server
+
+
+def test_broken_exif_fields_do_not_matter(tmp_path):
+    """A field of another type than its own, before the orientation."""
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x02"
+    exif += b"\x01\0\0\x02\0\0\0\x02A\0\0\0"  # width: text
+    exif += b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    path = plan(tmp_path / "a.png", two_rooms(0), exif=exif)
+    assert pictures.read(path, upright=True)[0].shape == (120, 70)

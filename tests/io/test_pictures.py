@@ -17,7 +17,7 @@ def plan(path, shade, **options):
 def test_every_picture_that_has_the_name_of_one_can_be_read(tmp_path, suffix):
     shade = np.full((40, 60, 3), 255)
     shade[:, :20] = 0
-    found = ros_map.read_picture(plan(tmp_path / "a.png", shade), 0.1)
+    found = ros_map.read_picture(plan(tmp_path / f"a{suffix}", shade), 0.1)
     assert pictures.is_picture(f"A{suffix.upper()}")
     assert found.occupied[:18].all() and found.free[22:].all() and not found.notes
 
@@ -200,7 +200,7 @@ def test_a_photograph_is_turned_as_viewers_do(tmp_path, orientation):
     exif[0x0112] = orientation
     shade = two_rooms(0)
     shade[:10] = shade[20:30, 80:90] = 0
-    path = plan(tmp_path / f"a{suffix}", shade, exif=exif)
+    path = plan(tmp_path / "a.png", shade, exif=exif)
     found = ros_map.read_picture(path, 0.1).free.T[::-1] == 1
     turns = {2: shade[:, ::-1], 3: shade[::-1, ::-1], 4: shade[::-1], 5: shade.T}
     turns |= {6: np.rot90(shade, -1), 7: shade[::-1, ::-1].T, 8: np.rot90(shade)}

@@ -42,7 +42,8 @@ def map_occupancy(
 
     Args:
         map_file: YAML file of map_server, with its image in the same folder; or a picture alone,
-            white where it is free.
+            white where it is free, black or else darker where there are walls; a grey around dark
+            outlines is unknown.
         robot_radius: Robot radius [m]: least distance of nodes and arcs to obstacles.
         min_obstacle_size: Minimum obstacle size [m]: smaller ones in free space are noise.
         regions: Connected regions of the robot's centre: the largest, or all of at least 1 m^2.

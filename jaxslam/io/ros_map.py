@@ -24,6 +24,7 @@ MODES = ("trinary", "scale", "raw")
 UNKNOWN_SHADE, FREE_SHADE = 205, 254  # [0, 255] that map_saver writes; 254 and 255 are free
 UNKNOWN_PROBABILITY = 1 - UNKNOWN_SHADE / 255
 THRESHOLDS = (0.196, 0.65)  # free below, occupied above; the shade 205 is just above the first
+MIN_WIDTH = 0.3  # [m] of the widest free place; below, white on a dark ground is lines
 FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 
@@ -88,25 +89,44 @@ def read(path: str | PathLike) -> OccupancyMap:
 
 
 def read_picture(path: str | PathLike, resolution: float) -> OccupancyMap:
-    """Read a map from a picture alone: white is free, black occupied.
+    """Read a map from a picture alone: light is free, dark occupied.
 
-    The thresholds are those that map_saver writes; the lower left corner is the origin. Where no
-    shade is dark enough for walls, the darker of two groups of shades is, and a note says so; among
-    these is map_saver's shade for unknown only where there is no other.
+    The thresholds are those that map_saver writes where black walls on white paper allow it, else
+    `pictures.plan_shades` finds them and what is unknown; what it guesses is in the notes. The
+    lower left corner, of the picture as viewers turn it, is the origin.
 
     Args:
         path: Image of one of `pictures.FORMATS`.
         resolution: [m] side of a cell.
 
     Raises:
-        InputError: The picture cannot be read, or has no cells or more than `MAX_CELLS`; the
-            resolution is out of range, or the map reaches beyond `MAX_COORDINATE`.
+        InputError: The picture cannot be read, or has no cells or more than `MAX_CELLS`; no pixel
+            is free, or only lines on a dark ground are; the resolution is out of range, or the map
+            reaches beyond `MAX_COORDINATE`.
     """
     _check_resolution(resolution, None)
-    shade, known = pictures.read(Path(path))
-    known, limits, notes = _of_plan(shade, known)
-    found = _to_map(shade, known, resolution, np.zeros(3), notes, ("trinary", False, *limits))
+    path = Path(path)
+    shade, known = pictures.read(path, upright=True)
+    plan = pictures.plan_shades(shade, known, resolution)
+    shade = np.where(plan.walls, np.float32(0.0), shade)
+    limits = THRESHOLDS if plan.limit is None else (1.0 - plan.limit, 1.0 - plan.limit)
+    meaning = ("trinary", False, *limits)
+    found = _to_map(
+        shade, known & ~plan.unknown, resolution, np.zeros(3), list(plan.notes), meaning
+    )
     _check_coordinates(found, path, None)
+    if not found.free.any():
+        advice = "invert it if it is light on dark, fill a transparent ground with white, or name "
+        advice += "a YAML file with negate: 1"
+        raise InputError("no pixel is white enough to be free", path=path, advice=advice)
+    if pictures.looks_inverted(found.occupied, found.free):
+        advice = "invert it, or name a YAML file with negate: 1"
+        width = 2.0 * resolution * pictures.half_width(found.free)
+        if width < MIN_WIDTH:
+            problem = f"white, which is free, is at most {width:.2g} m wide on a dark ground"
+            raise InputError(problem, path=path, advice=advice)
+        note = f"white is taken as free: if this plan is inverted, {advice}"
+        found = found._replace(notes=(*found.notes, note))
     return found
 
 
@@ -142,26 +162,6 @@ def _check_coordinates(found: OccupancyMap, path: str | PathLike, field: str | N
         raise InputError(
             problem, path=path, field=field, advice="give it in metres, nearer to 0, 0"
         )
-
-
-def _of_plan(
-    shade: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, tuple[float, float], list[str]]:
-    """Which pixels (H, W) of a picture alone are known, free_thresh and occupied_thresh, notes."""
-    free_below, occupied_above = THRESHOLDS
-    occupied = known & (1.0 - shade > occupied_above)
-    free = known & (1.0 - shade < free_below)
-    dark = known & ~free
-    if occupied.any() or not free.any() or not dark.any():
-        return known, THRESHOLDS, []
-    unknown = dark & (np.round(255.0 * shade) == UNKNOWN_SHADE)
-    if (dark & ~unknown).any():
-        known = known & ~unknown
-    limit = pictures.wall_shade(shade[known])
-    assert limit is not None  # there are two levels
-    darkest = round(255 * float(shade[known].min()))
-    note = f"the darkest shade is {darkest} of 255, so that all below {255 * limit:.0f} are walls"
-    return known, (1.0 - limit, 1.0 - limit), [note]
 
 
 def _to_map(

@@ -257,8 +257,8 @@ def test_a_plan_with_grey_walls_is_a_plan(tmp_path, capsys):
         Image.fromarray(np.where(shade == 255, 255, wall).astype(np.uint8)).save(plan)
         assert run_map(plan, "--resolution", 0.05, "--out", tmp_path / str(wall)) == 0
         said = capsys.readouterr().out
-        note = f"note: the darkest shade is {wall} of 255, so that all below "
-        assert (note in said) == (wall > 0) and said.count("note: ") == (wall > 0)
+        assert ("note: shades below " in said) == (wall > 0)
+        assert said.count("note: ") == (wall > 0)
         numbers.append(json.loads((tmp_path / str(wall) / "metrics.json").read_text()))
         del numbers[-1]["seconds"]
     assert numbers[0]["rooms"] == 2 and numbers[0]["arcs"] > 0
@@ -290,7 +290,7 @@ def test_rooms_keep_their_names_in_the_same_folder(tmp_path, capsys):
     rooms = rooms_file.read_rooms(out)
     assert {region.name for region in rooms.regions} == {"room_41", "room_2"}
     assert rooms.doors[0].name == "door_5" and rooms.last_numbers == (60, 7)
-    assert "note" not in capsys.readouterr().out
+    assert "new names" not in capsys.readouterr().out
     (out / "rooms.json").write_text("{}")
     assert run_map(*arguments) == 0
     assert "note: rooms and doors get new names: " in capsys.readouterr().out

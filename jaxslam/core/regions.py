@@ -77,7 +77,7 @@ class PlannerData(NamedTuple):
     Attributes:
         node_region: (N,) int index of the region that a node lies in, -1 for none.
         arc_region: (A,) int index of the region that most of an arc lies in, -1 for none.
-        arc_doors: Indices of the doors that each arc passes through, in its direction.
+        arc_doors: Indices of the doors that each arc passes through, or ends at, in its direction.
         arc_widths: A arrays (n,) [m] distance to the nearest obstacle at places of the arc, evenly
             from its first end to its last, its width profile; NaN where it is not known.
         frontier_doors: Indices of the doors between each open end and its node, in that direction;

@@ -101,7 +101,7 @@ def read_g2o(path: Path) -> Numbers:
 
 
 def read_graphml(path: Path, features: list[Numbers]) -> Numbers:
-    """How many nodes and arcs of map.graphml are as in map.geojson, in a map of one session."""
+    """How many nodes and arcs of map.graphml are as in map.geojson, open ends too."""
     import igraph
 
     graph = igraph.Graph.Read_GraphML(str(path))

@@ -32,7 +32,7 @@ def folder(tmp_path):
         closure_information=np.diag([1e4, 1e4, 1e5])[None],
     )
     g2o_writer.write(tmp_path / "graph.g2o", graph)
-    report.write_map(tmp_path / "map.geojson", building()._replace(frontier_id=np.zeros(0, int)))
+    report.write_map(tmp_path / "map.geojson", building())
     map_files.write_exports(tmp_path, building())
     return tmp_path
 
@@ -44,7 +44,7 @@ def test_all_that_is_written_arrives(folder):
     g2o = found["g2o"]
     assert (g2o["factors_read"], g2o["edges"], g2o["edges_of_landmarks"]) == (7, 7, 1)
     assert g2o["moved_m"] > 0.05 and g2o["difference_m"] < 0.002
-    assert found["graphml"] == {"nodes": 4, "arcs": 4, "right_nodes": 4, "right_arcs": 4}
+    assert found["graphml"] == {"nodes": 5, "arcs": 5, "right_nodes": 5, "right_arcs": 5}
     assert found["lif"]["edges"] == found["rmf"]["lanes"] > 0
 
 
@@ -57,4 +57,4 @@ def test_arcs_of_other_lengths_or_ends_are_counted_as_wrong(folder):
         if properties["id"] == 5:
             feature["geometry"]["coordinates"][0] += 1.0
     found = export_readers.read_graphml(folder / "map.graphml", content["features"])
-    assert found == {"nodes": 4, "arcs": 4, "right_nodes": 3, "right_arcs": 3}
+    assert found == {"nodes": 5, "arcs": 5, "right_nodes": 4, "right_arcs": 4}

@@ -20,6 +20,7 @@ LIDAR = Lidar(num_beams=181, angle_min=-np.pi, angle_increment=np.pi / 90, range
 CONFIG = Config.for_laser_log(LIDAR)
 T_SHAPE = (0.0, 0.0, 12.0, 2.0), (5.0, 2.0, 7.0, 7.0)
 PATH = np.array([[x, 1.0, 0.0] for x in np.arange(1.0, 11.0, 0.5)])
+pytestmark = pytest.mark.slow  # it compiles for half a minute
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ def write_exports(
         robot_radius: [m] that lanes keep from obstacles, as far as arcs do.
     """
     lanes = straight_lanes(graph, regions, planner, robot_radius=robot_radius, arc_ids=arc_ids)
-    nav2_lanes.write(out_dir / "map.nav2.geojson", graph, lanes, regions)
+    nav2_lanes.write(out_dir / "map.nav2.geojson", graph, lanes)
     lif.write(out_dir / "map.lif.json", graph, regions, planner, lanes=lanes)
     rmf_graph.write(out_dir / "map.rmf.yaml", graph, regions, planner, lanes=lanes)
     if find_spec("networkx") is not None:

@@ -103,10 +103,9 @@ def _edges(
         "rotationAtEndNodeAllowed": "BOTH",
     }
     ends = layout.names[lane.start], layout.names[lane.end]
-    label = lane.label._replace(doors=(lane.door,) if lane.door else ())
     return [
         {"edgeId": f"arc{lane.arc}_{lane.number}_{direction}"}
-        | _description("edgeDescription", label)
+        | _description("edgeDescription", lane.label)
         | {
             "startNodeId": start,
             "endNodeId": end,

@@ -11,26 +11,18 @@ from os import PathLike
 import numpy as np
 
 from jaxslam.core.maps import TopologicalMap
-from jaxslam.core.regions import Regions
 from jaxslam.io import geojson
 from jaxslam.io.nav2_metadata import door_operations, edge_metadata, node_metadata
-from jaxslam.io.route_labels import DOOR
 from jaxslam.io.straight_lanes import StraightLanes
 
 
-def write(
-    path: str | PathLike,
-    graph: TopologicalMap,
-    layout: StraightLanes,
-    regions: Regions | None = None,
-) -> None:
+def write(path: str | PathLike, graph: TopologicalMap, layout: StraightLanes) -> None:
     """Write the lanes of a map.
 
     Args:
         path: File to write, atomically.
         graph: The map.
         layout: Its points and lanes.
-        regions: Its rooms and doors.
 
     Raises:
         InputError: The file cannot be written.
@@ -45,14 +37,9 @@ def write(
         )
         for node, (x, y), label in zip(ids, layout.xy, layout.labels, strict=True)
     ]
-    kinds = {region.name: region.kind for region in regions.regions} if regions else {}
     arcs = []
     for number, lane in enumerate(layout.lanes):
         points = layout.xy[[lane.start, lane.end]]
-        doors = (lane.door,) if lane.door else ()
-        label = lane.label._replace(doors=doors, leaves=doors)
-        if not doors and label.kind == DOOR:
-            label = label._replace(kind=kinds.get(label.region, ""))
         arcs.append(
             geojson.Arc(
                 number,
@@ -61,8 +48,8 @@ def write(
                 float(np.hypot(*(points[1] - points[0]))),
                 np.nan,
                 points,
-                metadata=edge_metadata(label, lane.speed) | {"map_arc": lane.arc},
-                operations=door_operations(label),
+                metadata=edge_metadata(lane.label, lane.speed) | {"map_arc": lane.arc},
+                operations=door_operations(lane.label),
             )
         )
     geojson.write(path, nodes, arcs)

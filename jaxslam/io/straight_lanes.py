@@ -6,7 +6,7 @@ points are added too: a lane through a door is short. Corners, at walls and with
 ends are no points.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxslam.core import polylines
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.regions import Door, PlannerData, Regions
 from jaxslam.core.types import JUNCTION, as_float64
-from jaxslam.io.route_labels import Label, arc_clearances, has_leaf, labels, speed_fraction
+from jaxslam.io.route_labels import DOOR, Label, arc_clearances, has_leaf, labels, speed_fraction
 
 TOLERANCE = 0.1  # [m] largest distance of a lane from its arc
 LEAST_TOLERANCE = 0.02  # [m] of lanes where the robot just fits
@@ -32,7 +32,7 @@ class Lane(NamedTuple):
         arc: Id of its arc.
         number: Lanes of the arc before it.
         door: Name of the door that it passes through, empty for none.
-        label: Of the arc.
+        label: Of its arc, with its own door alone.
         speed: Fraction of the full speed, by the narrowest place of the arc.
     """
 
@@ -84,6 +84,7 @@ def straight_lanes(
         ValueError: `planner` is of another map, a line is no polyline, or a number is not finite.
     """
     of_nodes, of_arcs = labels(graph, regions, planner)
+    kinds = {} if regions is None else {region.name: region.kind for region in regions.regions}
     clearances = arc_clearances(graph, planner)
     xy = as_float64("xy", graph.xy, ("N", 2))
     ends = np.asarray(graph.arc_ends, int).reshape(-1, 2)
@@ -112,13 +113,22 @@ def straight_lanes(
         stops = [int(index[start]), *more, int(index[end])]
         speed = speed_fraction(float(clearances[arc]))
         lanes += [
-            Lane(stops[k], stops[k + 1], arc_id, k, door, of_arcs[arc], speed)
+            Lane(
+                stops[k], stops[k + 1], arc_id, k, door, _of_lane(of_arcs[arc], door, kinds), speed
+            )
             for k, door in enumerate(doors)
         ]
     positions = np.reshape(points, (-1, 2))
     if not np.isfinite(positions).all():
         raise ValueError("the map has a position that is not finite")
     return StraightLanes(tuple(names), positions, tuple(point_labels), tuple(lanes))
+
+
+def _of_lane(label: Label, door: str, kinds: Mapping[str, str]) -> Label:
+    """Label of a lane that passes through a door, empty for none, of an arc with a label."""
+    doors = (door,) if door else ()
+    kind = kinds.get(label.region, "") if label.kind == DOOR and not door else label.kind
+    return label._replace(kind=kind, doors=doors, leaves=doors)
 
 
 def _along(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

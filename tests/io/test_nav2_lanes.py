@@ -12,7 +12,7 @@ from jaxslam.io.straight_lanes import TOLERANCE, straight_lanes
 
 
 def written(path):
-    nav2_lanes.write(path, building(), straight_lanes(building(), regions(), planner()), regions())
+    nav2_lanes.write(path, building(), straight_lanes(building(), regions(), planner()))
     return json.loads(path.read_text())
 
 

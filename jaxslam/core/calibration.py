@@ -79,12 +79,12 @@ class Calibration(NamedTuple):
 
 def calibrate_odometry(
     calibration: Calibration,
-    odometry: AnyArray,
+    odometry: Any,
     *,
-    times: AnyArray | None = None,
-    mount: AnyArray | None = None,
+    times: Any = None,
+    mount: Any = None,
     wheel_base: float = 0.0,
-) -> AnyArray:
+) -> Any:
     """Increments of the scanner from those of odometry, with systematic errors removed.
 
     Args:
@@ -113,8 +113,8 @@ def calibrate_odometry(
 
 
 def scale_increments(
-    calibration: Calibration, odometry: AnyArray, *, wheel_base: float = 0.0
-) -> AnyArray:
+    calibration: Calibration, odometry: Any, *, wheel_base: float = 0.0
+) -> Any:
     """Increments (..., 3) of the robot, of which the wheels report `odometry` (..., 3).
 
     With d the length of an increment's arc, and t its turn,
@@ -137,7 +137,7 @@ def scale_increments(
     return xp.concat([moved, turned[..., None]], axis=-1)
 
 
-def _shift(odometry: AnyArray, times: AnyArray, offset: AnyArray) -> AnyArray:
+def _shift(odometry: Any, times: Any, offset: Any) -> Any:
     """Increments (T, 3) between the times `times` + `offset`, on arcs between two scans.
 
     Before the first scan, and after the last one, the robot stands still.
@@ -159,7 +159,7 @@ def _shift(odometry: AnyArray, times: AnyArray, offset: AnyArray) -> AnyArray:
     return xp.concat([xp.zeros((1, 3), dtype=odometry.dtype), moved])
 
 
-def _part(increments: AnyArray, fraction: AnyArray) -> AnyArray:
+def _part(increments: Any, fraction: Any) -> Any:
     """The first part of increments (..., 3), each an arc, by fractions (...)."""
     xp = increments.__array_namespace__()
     turn = increments[..., 2]
@@ -168,18 +168,18 @@ def _part(increments: AnyArray, fraction: AnyArray) -> AnyArray:
     return xp.concat([moved, (fraction * turn)[..., None]], axis=-1)
 
 
-def _change_frame(increments: AnyArray, frame: AnyArray) -> AnyArray:
+def _change_frame(increments: Any, frame: Any) -> Any:
     """Increments (..., 3) of a frame (3,) that is fixed to what moves by `increments`."""
     return _compose(_inverse(frame), _compose(increments, frame))
 
 
-def _inverse(pose: AnyArray) -> AnyArray:
+def _inverse(pose: Any) -> Any:
     """Pose (3,) of the outer frame in the inner one."""
     xp = pose.__array_namespace__()
     return _relative(pose, xp.zeros_like(pose))
 
 
-def _compose(pose: AnyArray, increment: AnyArray) -> AnyArray:
+def _compose(pose: Any, increment: Any) -> Any:
     """`se2.compose` of (..., 3) in either namespace."""
     xp = pose.__array_namespace__()
     moved = _rotate(increment[..., :2], pose[..., 2])
@@ -188,7 +188,7 @@ def _compose(pose: AnyArray, increment: AnyArray) -> AnyArray:
     return xp.stack([x, y, wrap(pose[..., 2] + increment[..., 2])], axis=-1)
 
 
-def _relative(a: AnyArray, b: AnyArray) -> AnyArray:
+def _relative(a: Any, b: Any) -> Any:
     """`se2.relative` of (..., 3) in either namespace."""
     xp = a.__array_namespace__()
     gap = _rotate(b[..., :2] - a[..., :2], -a[..., 2])
@@ -196,7 +196,7 @@ def _relative(a: AnyArray, b: AnyArray) -> AnyArray:
     return xp.concat([gap, wrap(b[..., 2:] - a[..., 2:])], axis=-1)
 
 
-def _rotate(xy: AnyArray, angle: AnyArray) -> AnyArray:
+def _rotate(xy: Any, angle: Any) -> Any:
     """Vectors (..., 2) turned by angles (...)."""
     xp = xy.__array_namespace__()
     cos, sin = xp.cos(angle), xp.sin(angle)

@@ -45,7 +45,7 @@ class Calibration(NamedTuple):
     @classmethod
     def identity(cls) -> "Calibration":
         """A robot without systematic errors, in NumPy."""
-        one, zero = np.float64(1.0), np.float64(0.0)
+        one, zero = np.ones(()), np.zeros(())
         return cls(one, one, zero, np.zeros(3), zero)
 
     @classmethod

@@ -108,7 +108,7 @@ def _step(
     is_known = measurement.landmark_ids is not None
     if is_known:
         config = config._replace(confirm_count=1, wall_confirm_count=1)
-    features, features_cov = _select(config, params, measurement.features)
+    features, features_cov = _select(config, params, measurement)
     predicted = _predict(config, params, belief, measurement)
     found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
     matches = _choose(config, predicted, features, found.slot)
@@ -129,13 +129,14 @@ _compiled_step = partial(jax.jit, static_argnames="config")(_step)
 
 
 def _select(
-    config: FilterConfig, params: NoiseParams, features: Features
+    config: FilterConfig, params: NoiseParams, measurement: Measurement
 ) -> tuple[Features, Array]:
     """Features of the configured kinds, and their measurement covariance R (M, 2, 2)."""
-    allowed = jnp.isin(features.kind, jnp.array(config.landmark_kinds, jnp.int32))
-    features = restrict_features(features, allowed)
+    kind = measurement.features.kind
+    allowed = jnp.isin(kind, jnp.array(config.landmark_kinds, jnp.int32))
+    features = restrict_features(measurement.features, allowed)
     return features, measurement_cov(
-        params, features, untrusted_inflation=config.untrusted_inflation
+        params, features, measurement, untrusted_inflation=config.untrusted_inflation
     )
 
 

@@ -61,7 +61,8 @@ def _noise_model(
 
     def of_scan(measurement: Measurement) -> tuple[Array, Array, Array]:
         motion, q = motion_estimate(params, measurement)
-        r = measurement_cov(params, measurement.features, untrusted_inflation=inflation)
+        features = measurement.features
+        r = measurement_cov(params, features, measurement, untrusted_inflation=inflation)
         return motion, q, r
 
     return jax.vmap(of_scan)(measurements)

@@ -132,7 +132,7 @@ def _build_problem(
         odometry=odometry,
         odometry_cov=odometry_cov + floor[None],
         measurement=jax.vmap(measurement_model.measure)(features),
-        measurement_cov=jax.vmap(of_features)(features),
+        measurement_cov=jax.vmap(of_features)(features, measurements),
         kind=features.kind,
         landmark_index=jnp.where(features.valid, landmark_index, -1),
     )

@@ -44,6 +44,8 @@ class NoiseParams(NamedTuple):
         odometry_weights: Weights of factors on the standard deviations of Q, that depend on the
             step; any sign (`heteroscedastic`).
         measurement_weights: Likewise of R.
+        student_dof: () degrees of freedom of a Student t distribution that the innovations of
+            features have instead of a Gaussian (`robust`); Q and R are then scales.
     """
 
     odometry_coefficients: Array
@@ -55,6 +57,7 @@ class NoiseParams(NamedTuple):
     odometry_cov_rate: Array | None = None
     odometry_weights: OdometryWeights | None = None
     measurement_weights: MeasurementWeights | None = None
+    student_dof: Array | None = None
 
     @classmethod
     def for_simulated_robot(

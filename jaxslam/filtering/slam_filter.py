@@ -10,7 +10,7 @@ from jax import lax
 from jaxslam.core.features import Features, restrict_features
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import WALL, Array
-from jaxslam.filtering import ekf
+from jaxslam.filtering import ekf, robust
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.config import FilterConfig, check_config, required_observations
 from jaxslam.filtering.data_association import Association, Matches, associate, use_known_ids
@@ -19,6 +19,7 @@ from jaxslam.filtering.joint_covariance import LinearizedMeasurements, mask_meas
 from jaxslam.filtering.kalman import UpdateResult, innovation_cov, log_likelihood
 from jaxslam.filtering.match_verification import verify_matches
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
+from jaxslam.filtering.robust import Score
 from jaxslam.filtering.track_management import add_landmarks, manage_tracks
 
 
@@ -31,9 +32,10 @@ class StepInfo(NamedTuple):
         slot: (M,) int32 slot of each feature's landmark, matched or new; L for none.
         id: (M,) int32 id of that landmark, -1 for none.
         used: (M,) bool, the feature updated the state.
-        nis: () normalised innovation squared, of all used features together.
+        nis: () normalised innovation squared, of all used features together; of the scales with
+            `params.student_dof`.
         dof: () int32 its degrees of freedom.
-        log_likelihood: () [nats] of the innovations.
+        log_likelihood: () [nats] of the innovations, Gaussian or Student t.
         finite: () bool, False where the update was not finite and was left out.
         num_new: () int32 number of new landmarks.
         num_pruned: () int32 number of landmarks that were pruned, unconfirmed ones included.
@@ -67,6 +69,7 @@ def step(
         choose     the matches that update the state: confirmed landmarks, walls first
         linearise  their innovations
         verify     them jointly, and drop the rejected ones
+        reweight   the features, if their noise is a Student t distribution
         update     the belief; leave the update out if it is not finite
         manage     the tracks: record observations, prune landmarks, merge duplicates
         add        new landmarks, evicting unconfirmed ones from a full map
@@ -115,12 +118,25 @@ def _step(
     chosen, rows = _linearise(config, predicted, features, features_cov, matches)
     if not is_known:
         predicted, rows, matches = _verify(config, predicted, chosen, rows, matches)
+    score = None
+    if params.student_dof is not None:
+        size = jnp.where(matches.used[matches.order], _degrees(chosen), 0)
+        cov = ekf.covariance_blocks(predicted)
+        rows, score = robust.reweight(params.student_dof, cov, rows, size)
     updated, result, matches = _update(config, predicted, rows, matches)
     tracked, pruned, merged = manage_tracks(config, updated, features, matches, is_known)
     found = found._replace(is_new=found.is_new & result.ok)
     mapped, new_slot, evicted = add_landmarks(config, tracked, features, features_cov, found)
     info = _step_info(
-        mapped, features, matches, new_slot, result, pruned=pruned, merged=merged, evicted=evicted
+        mapped,
+        features,
+        matches,
+        new_slot,
+        result,
+        score,
+        pruned=pruned,
+        merged=merged,
+        evicted=evicted,
     )
     return mapped, info
 
@@ -237,6 +253,7 @@ def _step_info(
     matches: Matches,
     new_slot: Array,
     result: UpdateResult,
+    score: Score | None,
     *,
     pruned: Array,
     merged: Array,
@@ -245,23 +262,30 @@ def _step_info(
     """Diagnostics of the step; the likelihood of an update that was left out is zero."""
     size = belief.num_seen.size
     slot = jnp.minimum(matches.slot, new_slot)
-    degrees = jnp.where(features.kind == WALL, 1, 2)
-    dof = jnp.sum(jnp.where(matches.used, degrees, 0), dtype=jnp.int32)
+    dof = jnp.sum(jnp.where(matches.used, _degrees(features), 0), dtype=jnp.int32)
+    nis = result.nis if score is None else score.nis
     return StepInfo(
         pose=belief.pose,
         pose_cov=belief.pose_cov,
         slot=slot,
         id=belief.id.at[slot].get(mode="fill", fill_value=-1),
         used=matches.used,
-        nis=jnp.where(result.ok, result.nis, 0.0),
+        nis=jnp.where(result.ok, nis, 0.0),
         dof=dof,
-        log_likelihood=jnp.where(result.ok, log_likelihood(result, dof), 0.0),
+        log_likelihood=jnp.where(
+            result.ok, log_likelihood(result, dof) if score is None else score.log_likelihood, 0.0
+        ),
         finite=result.ok,
         num_new=jnp.sum(new_slot < size, dtype=jnp.int32),
         num_pruned=pruned,
         num_evicted=evicted,
         num_merged=merged,
     )
+
+
+def _degrees(features: Features) -> Array:
+    """Numbers (...) that the measurement of a feature has."""
+    return jnp.where(features.kind == WALL, 1, 2)
 
 
 def run_filter(

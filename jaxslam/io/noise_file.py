@@ -40,6 +40,7 @@ OPTIONAL: Mapping[str, tuple[int, ...]] = MappingProxyType(
         "odometry_cov_rate": (3, 3),
         **{f"odometry_weights.{name}": (3,) for name in ODOMETRY},
         **{f"measurement_weights.{name}": (3,) for name in MEASUREMENT},
+        "student_dof": (),
     }
 )
 """Shape of each key that a file may have where the template has None; it is read then, too."""

@@ -15,6 +15,7 @@ from jax import lax
 from experiments import common
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features, zero_padding
+from jaxslam.core.measurement import Measurement
 from jaxslam.core.se2 import compose, wrap_direction
 from jaxslam.core.types import JUNCTION, WALL, Array, Key
 from jaxslam.filtering import motion_model
@@ -68,7 +69,9 @@ def _root(cov: Array) -> Array:
     return jnp.linalg.cholesky(cov + 1e-12 * eye)
 
 
-def measure(key: Key, params: NoiseParams, positions: Array, pose: Array) -> tuple[Features, Array]:
+def measure(
+    key: Key, params: NoiseParams, positions: Array, pose: Array, odometry: Array
+) -> tuple[Features, Array]:
     """Noisy features at a pose (3,), and which landmark each is (MAX_SEEN + 1,)."""
     keys = jax.random.split(key, 2)
     distance = jnp.linalg.norm(positions - pose[None, :2], axis=1)
@@ -98,7 +101,9 @@ def measure(key: Key, params: NoiseParams, positions: Array, pose: Array) -> tup
             valid=valid,
         )
 
-    roots = jax.vmap(_root)(measurement_cov(params, features(exact)))
+    noise_free = features(exact)
+    R = measurement_cov(params, noise_free, Measurement(odometry, noise_free))
+    roots = jax.vmap(_root)(R)
     error = jnp.einsum("mij,mj->mi", roots, jax.random.normal(keys[1], exact.shape, exact.dtype))
     one = jnp.ones_like(scale)  # a wall's direction is one number
     error = error * jnp.stack([one, jnp.where(kind == JUNCTION, one, 0.0)], axis=1)
@@ -118,13 +123,14 @@ def drive(
         root = _root(motion_model.odometry_cov(params.odometry_coefficients, command))
         increment = command + root @ jax.random.normal(keys[0], (3,), pose.dtype)
         pose = compose(pose, jnp.where(jnp.any(command != 0.0), increment, 0.0))
-        return (pose, index), (pose, command, *measure(keys[1], params, positions, pose))
+        return (pose, index), (pose, command, *measure(keys[1], params, positions, pose, command))
 
     first = start_pose(path)
     keys = jax.random.split(key, num_scans)
-    begin = first, jnp.zeros(3, path.dtype), *measure(keys[0], params, positions, first)
-    _, rest = lax.scan(step, (first, jnp.int32(0)), keys[1:])
-    whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, rest)
+    rest = jnp.zeros(3, path.dtype)
+    begin = first, rest, *measure(keys[0], params, positions, first, rest)
+    _, others = lax.scan(step, (first, jnp.int32(0)), keys[1:])
+    whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, others)
     return Episode(*whole)
 
 

@@ -17,6 +17,7 @@ from jaxslam.core.types import Array, check_array, check_type
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.heteroscedastic import WEIGHTS
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.odometry_bias import NUM_BIASES
 
 # Fields of `Features` that hold floats, with their trailing sizes.
 FLOATS: dict[str, tuple[int, ...]] = {
@@ -34,9 +35,13 @@ OTHERS = {
     "trusted": (jnp.bool_, jnp.bool_),
     "valid": (jnp.bool_, jnp.bool_),
 }
-MAY_BE_ZERO = ("odometry_coefficients",)  # no error that grows with distance, or with rotation
+MAY_BE_ZERO = ("odometry_coefficients", "odometry_bias_walk")  # what does not grow
 OPTIONAL = tuple(NoiseParams._field_defaults)  # fields of the noise that may be None
-SHAPES: dict[str, tuple[int, ...]] = {"odometry_coefficients": (4,), "odometry_cov_rate": (3, 3)}
+SHAPES: dict[str, tuple[int, ...]] = {
+    "odometry_coefficients": (4,),
+    "odometry_cov_rate": (3, 3),
+    "odometry_bias_walk": (NUM_BIASES,),
+}
 """Shapes of the fields of `NoiseParams` that are no single number."""
 
 
@@ -100,6 +105,8 @@ def check_params(
         if value is None and field in OPTIONAL:
             return None
         name = f"params.{field}"
+        if field == "custom":
+            return as_tree(name, value, dtype, check_values=check_values)
         if field in WEIGHTS:
             return _as_weights(name, value, WEIGHTS[field], dtype, check_values=check_values)
         array = _floats(name, value, SHAPES.get(field, ()), dtype)
@@ -120,6 +127,20 @@ def _as_weights(name: str, weights: Any, kind: Any, dtype: Any, *, check_values:
         if check_values and numbers is not None and not np.isfinite(numbers).all():
             raise ValueError(f"{name}.{field} is {numbers.tolist()}, not finite")
     return kind(**arrays)
+
+
+def as_tree(name: str, tree: Any, dtype: Any, *, check_values: bool) -> Any:
+    """A tree of arrays of any shapes as JAX arrays of floats; checked, finite where concrete."""
+
+    def convert(path: Any, x: Any) -> Array:
+        own = name + jax.tree_util.keystr(path)
+        array = as_float(own, x, (...,)).astype(dtype)
+        numbers = concrete_values(array)
+        if check_values and numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"{own} holds numbers that are not finite")
+        return array
+
+    return jax.tree_util.tree_map_with_path(convert, tree)
 
 
 def _check_values(name: str, field: str, array: Array) -> None:

@@ -18,6 +18,7 @@ from jaxslam.filtering.heteroscedastic import (
     odometry_factors,
 )
 from jaxslam.filtering.motion_model import odometry_cov, odometry_rate_cov, wheel_coefficients
+from jaxslam.filtering.noise_model import NoiseModel, change_measurement_cov, change_odometry_cov
 from jaxslam.matching import odometry_fusion
 
 
@@ -46,6 +47,9 @@ class NoiseParams(NamedTuple):
         measurement_weights: Likewise of R.
         student_dof: () degrees of freedom of a Student t distribution that the innovations of
             features have instead of a Gaussian (`robust`); Q and R are then scales.
+        odometry_bias_walk: (3,) growth of the standard deviations of the biases of odometry, per
+            root of a metre (`odometry_bias`); None: they are constant. 0 for one that is.
+        custom: Parameters of `FilterConfig.noise_model`: any tree of arrays, of any sign.
     """
 
     odometry_coefficients: Array
@@ -58,6 +62,8 @@ class NoiseParams(NamedTuple):
     odometry_weights: OdometryWeights | None = None
     measurement_weights: MeasurementWeights | None = None
     student_dof: Array | None = None
+    odometry_bias_walk: Array | None = None
+    custom: Any = None
 
     @classmethod
     def for_simulated_robot(
@@ -107,6 +113,7 @@ def measurement_cov(
     measurement: Measurement,
     *,
     untrusted_inflation: float = 1.0,
+    noise_model: NoiseModel | None = None,
 ) -> Array:
     """Measurement covariance R (M, 2, 2) of the features of a scan.
 
@@ -124,6 +131,7 @@ def measurement_cov(
         features: Features of a scan, of the configured kinds.
         measurement: Of the step, whose features they are.
         untrusted_inflation: Factor on the standard deviation of points that are not trusted.
+        noise_model: Functions that change R, if any.
     """
     own = jax.vmap(measurement_model.polar_cov)(features.xy, features.cov)
     added = jnp.diag(jnp.stack([params.range_std, params.bearing_std]) ** 2)
@@ -136,15 +144,21 @@ def measurement_cov(
         point *= factors[:, :2, None] * factors[:, None, :2]
         angle *= factors[:, 2] ** 2
     wall = jnp.stack([jnp.stack([angle, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
-    return jnp.where((features.kind == WALL)[:, None, None], wall, point)
+    R = jnp.where((features.kind == WALL)[:, None, None], wall, point)
+    if noise_model is None:
+        return R
+    return change_measurement_cov(noise_model, params.custom, features, measurement, R)
 
 
-def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Array, Array]:
+def motion_estimate(
+    params: NoiseParams, measurement: Measurement, *, noise_model: NoiseModel | None = None
+) -> tuple[Array, Array]:
     """Odometry increment of a step, fused with scan matching where there is any.
 
     Args:
         params: Noise parameters.
         measurement: Odometry, and scan matching if any.
+        noise_model: Functions that change Q, if any.
 
     Returns:
         The increment (3,) [m, m, rad] since the step before, in the frame of that pose, and its
@@ -167,6 +181,8 @@ def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Arra
     motion_cov = odometry_cov(coefficients, measurement.odometry)
     if rate is not None:
         motion_cov += odometry_rate_cov(rate, measurement.odometry)
+    if noise_model is not None:
+        motion_cov = change_odometry_cov(noise_model, params.custom, measurement, motion_cov)
     if measurement.scan_match is None:
         return measurement.odometry, motion_cov
     if scan_match_std_scale is None:

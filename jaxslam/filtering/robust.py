@@ -111,7 +111,7 @@ def _own_squares(s: Array, residual: Array) -> Array:
 
 
 def _log_gamma_ratio(x: Array) -> Array:
-    """log Gamma(x + 1/2) - log Gamma(x) of x > 0, without the cancellation for large x.
+    """Log Gamma(x + 1/2) - log Gamma(x) of x > 0, without the cancellation for large x.
 
     By Gamma(x + 1) = x Gamma(x) from x + 5, where Stirling's series leaves less than 2e-8.
     """

@@ -103,14 +103,19 @@ _DERIVED: Mapping[str, Callable[[int], int]] = {
 
 
 def pack(saved: SavedMap) -> dict[str, np.ndarray]:
-    """The arrays of a map, not checked; ValueError if the covariance is no square matrix."""
+    """The arrays of a map, not checked; ValueError if the covariance is no square matrix.
+
+    Parameters of a noise model of one's own are left out: a file does not have the model.
+    """
     hit, graph = np.asarray(saved.scans.hit), saved.topological_map
     cov = np.asarray(saved.belief.map_cov)
     check_array("belief.map_cov", cov, (len(cov), len(cov)))
     lidar = Lidar(int(saved.lidar.num_beams), *map(float, saved.lidar[1:]))
     ranges = np.where(hit, saved.scans.ranges, np.float32(0.0))
     arrays = {name: np.asarray(getattr(saved, name)) for name in ("times", "poses", "pose_cov")}
-    arrays |= {"scans.ranges": ranges} | _fields("lidar", lidar) | _fields("params", saved.params)
+    arrays |= {"scans.ranges": ranges} | _fields("lidar", lidar) | _fields(
+        "params", saved.params._replace(custom=None)
+    )
     arrays |= _fields("belief", saved.belief._replace(map_cov=cov[_upper(len(cov))]))
     arrays |= _fields("arcs", saved.arcs)
     rest = {k: v for k, v in graph._asdict().items() if k not in ("arc_lines", "frontiers")}

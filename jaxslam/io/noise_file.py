@@ -41,6 +41,7 @@ OPTIONAL: Mapping[str, tuple[int, ...]] = MappingProxyType(
         **{f"odometry_weights.{name}": (3,) for name in ODOMETRY},
         **{f"measurement_weights.{name}": (3,) for name in MEASUREMENT},
         "student_dof": (),
+        "odometry_bias_walk": (3,),
     }
 )
 """Shape of each key that a file may have where the template has None; it is read then, too."""

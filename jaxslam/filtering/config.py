@@ -195,19 +195,19 @@ def with_options(config: FilterConfig, belief: Belief) -> Belief:
     return belief
 
 
-def check_options(config: FilterConfig, params: NoiseParams, belief: Belief) -> None:
+def check_options(config: FilterConfig, params: NoiseParams, belief: Belief | None = None) -> None:
     """Check that parameters and belief have what the options of the configuration need.
+
+    Args:
+        config: Static configuration of the filter.
+        params: Noise parameters.
+        belief: Belief, if there is one already.
 
     Raises:
         ValueError: One has something that the configuration does not use, or lacks something.
     """
-    advice = "make the belief by init(config, pose), or with_options(config, belief)"
-    for option, field in (("odometry_bias_std", "bias"), ("adaptation", "adaptation")):
-        wanted, given = getattr(config, option) is not None, getattr(belief, field) is not None
-        if wanted != given:
-            states = "is given", "is None"
-            first, second = states if wanted else states[::-1]
-            raise ValueError(f"config.{option} {first}, but belief.{field} {second}; {advice}")
+    if belief is not None:
+        _check_belief(config, belief)
     if params.odometry_bias_walk is not None and config.odometry_bias_std is None:
         raise ValueError(
             "params.odometry_bias_walk is given, but config.odometry_bias_std is None: there are "
@@ -217,6 +217,18 @@ def check_options(config: FilterConfig, params: NoiseParams, belief: Belief) -> 
         raise ValueError(
             "params.custom is given, but config.noise_model is None: nothing would use it"
         )
+
+
+def _check_belief(config: FilterConfig, belief: Belief) -> None:
+    """Raise ValueError unless a belief has what the options of the configuration need, no more."""
+    for option, field in (("odometry_bias_std", "bias"), ("adaptation", "adaptation")):
+        wanted, given = getattr(config, option) is not None, getattr(belief, field) is not None
+        if wanted != given:
+            of_config, of_belief = ("is given", "is None") if wanted else ("is None", "is given")
+            raise ValueError(
+                f"config.{option} {of_config}, but belief.{field} {of_belief}; make the belief by "
+                "init(config, pose), or with_options(config, belief)"
+            )
 
 
 def required_observations(config: FilterConfig, kind: Array) -> Array:

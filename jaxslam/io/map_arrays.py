@@ -113,8 +113,10 @@ def pack(saved: SavedMap) -> dict[str, np.ndarray]:
     lidar = Lidar(int(saved.lidar.num_beams), *map(float, saved.lidar[1:]))
     ranges = np.where(hit, saved.scans.ranges, np.float32(0.0))
     arrays = {name: np.asarray(getattr(saved, name)) for name in ("times", "poses", "pose_cov")}
-    arrays |= {"scans.ranges": ranges} | _fields("lidar", lidar) | _fields(
-        "params", saved.params._replace(custom=None)
+    arrays |= (
+        {"scans.ranges": ranges}
+        | _fields("lidar", lidar)
+        | _fields("params", saved.params._replace(custom=None))
     )
     arrays |= _fields("belief", saved.belief._replace(map_cov=cov[_upper(len(cov))]))
     arrays |= _fields("arcs", saved.arcs)

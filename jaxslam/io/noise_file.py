@@ -45,8 +45,10 @@ OPTIONAL: Mapping[str, tuple[int, ...]] = MappingProxyType(
     }
 )
 """Shape of each key that a file may have where the template has None; it is read then, too."""
-SIGNED = ("odometry_weights", "measurement_weights")
+SIGNED = ("odometry_weights", "measurement_weights", "custom")
 """Fields whose numbers may be negative or 0."""
+MAY_BE_ZERO = ("odometry_bias_walk",)
+"""Fields whose numbers may be 0, but not negative."""
 COVARIANCES = ("odometry_cov_rate",)
 """Fields that are covariance matrices."""
 
@@ -231,6 +233,10 @@ def _check_values(path: str | PathLike, key: str, array: np.ndarray) -> None:
         if field in COVARIANCES and not _is_covariance(array):
             advice = "give a symmetric matrix without negative eigenvalues"
             raise InputError("is no covariance", path=path, field=key, advice=advice)
+    elif field in MAY_BE_ZERO:
+        if not (np.isfinite(array) & (array >= 0.0)).all():
+            advice = "give finite numbers of 0 or more"
+            raise InputError(f"{array.tolist()} is below 0", path=path, field=key, advice=advice)
     elif not (np.isfinite(array) & (array > 0.0)).all():
         advice = "standard deviations are finite and above 0"
         raise InputError(f"{array.tolist()} is not positive", path=path, field=key, advice=advice)

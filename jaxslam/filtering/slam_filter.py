@@ -101,10 +101,10 @@ def step(
     return _compiled_step(config, params, belief, measurement)
 
 
-def _step(
+def unchecked_step(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> tuple[Belief, StepInfo]:
-    """`step`, of inputs that are checked."""
+    """`step` of inputs that are checked; not jitted, for a scan over time."""
     is_known = measurement.landmark_ids is not None
     if is_known:
         config = config._replace(confirm_count=1, wall_confirm_count=1)
@@ -125,7 +125,7 @@ def _step(
     return mapped, info
 
 
-_compiled_step = partial(jax.jit, static_argnames="config")(_step)
+_compiled_step = partial(jax.jit, static_argnames="config")(unchecked_step)
 
 
 def _select(
@@ -296,6 +296,6 @@ def _run(
     """`run_filter`, of inputs that are checked."""
 
     def body(belief: Belief, now: Measurement) -> tuple[Belief, StepInfo]:
-        return _step(config, params, belief, now)
+        return unchecked_step(config, params, belief, now)
 
     return lax.scan(body, belief, measurements)

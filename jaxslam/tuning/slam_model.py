@@ -46,7 +46,7 @@ class SlamStep(NamedTuple):
         self, params: NoiseParams, belief: Belief, now: Measurement
     ) -> tuple[Belief, StepInfo]:
         """One step of `slam_filter`."""
-        return slam_filter.step(self.config, params, belief, now)
+        return slam_filter.unchecked_step(self.config, params, belief, now)
 
 
 def measurements(params: NoiseParams, episode: Episode) -> Measurement:

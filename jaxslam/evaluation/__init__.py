@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from jaxslam.evaluation.consistency import nees_per_dof as nees_per_dof
     from jaxslam.evaluation.consistency import pose_error as pose_error
     from jaxslam.evaluation.consistency import rmse as rmse
+    from jaxslam.evaluation.filter_consistency import ConsistencyReport as ConsistencyReport
+    from jaxslam.evaluation.filter_consistency import consistency_of_nis as consistency_of_nis
+    from jaxslam.evaluation.filter_consistency import consistency_report as consistency_report
+    from jaxslam.evaluation.filter_consistency import report_metrics as report_metrics
     from jaxslam.evaluation.log_errors import Trajectory as Trajectory
     from jaxslam.evaluation.log_errors import errors_against as errors_against
     from jaxslam.evaluation.log_errors import mean_ate as mean_ate
@@ -29,6 +33,9 @@ __getattr__, __all__ = lazy_names(  # noqa: PLE0604
     {
         "jaxslam.core.types": "Metrics",
         "jaxslam.evaluation.consistency": "chi_square_bounds nees nees_per_dof pose_error rmse",
+        "jaxslam.evaluation.filter_consistency": (
+            "ConsistencyReport consistency_of_nis consistency_report report_metrics"
+        ),
         "jaxslam.evaluation.log_errors": "Trajectory errors_against mean_ate mean_nees_per_dof",
         "jaxslam.evaluation.summary": "evaluate",
         "jaxslam.evaluation.trajectory": "align_trajectory ate relation_errors rpe",

@@ -26,6 +26,7 @@ class Estimate(NamedTuple):
         positive: Whether it can only be positive; its axis is then logarithmic.
         frozen: Whether it was not tuned.
         identifiable: Whether the data determine it.
+        unit: Its unit; "" for none.
     """
 
     name: str
@@ -35,6 +36,12 @@ class Estimate(NamedTuple):
     positive: bool = True
     frozen: bool = False
     identifiable: bool = True
+    unit: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name and unit."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -76,7 +83,7 @@ def draw_estimates(axis: Axes, estimates: Sequence[Estimate]) -> None:
             _text(each), (1.0, row), (4, 0), xycoords=("axes fraction", "data"),
             textcoords="offset points", va="center", fontsize=6, color=colour,
         )  # fmt: skip
-    axis.set_yticks(range(len(estimates)), [each.name for each in estimates])
+    axis.set_yticks(range(len(estimates)), [each.label for each in estimates])
     axis.set_ylim(len(estimates) - 0.4, -0.6)
     axis.grid(axis="x", linewidth=0.3)
     if positive:

@@ -18,6 +18,7 @@ from jaxslam.viz.parameter_charts import Estimate, draw_correlations, draw_estim
 SIZE = 8.27, 11.69  # [inch] A4
 DOTS_PER_INCH = 150
 CHARACTERS = 132  # of a line of text across the page
+CHARACTER_WIDTH = 0.055  # [inch] of names
 MAX_LINES = 4  # of findings of each state, and of notes
 
 
@@ -26,6 +27,7 @@ class TuningPage(NamedTuple):
 
     Attributes:
         title: What was tuned, on what.
+        subtitle: How, and what it is evaluated on.
         before: Consistency of the filter before, on what it is evaluated on; None: not known.
         after: Consistency after.
         estimates: The parameters.
@@ -38,6 +40,7 @@ class TuningPage(NamedTuple):
     """
 
     title: str
+    subtitle: str
     before: ConsistencyReport | None
     after: ConsistencyReport | None
     estimates: Sequence[Estimate]
@@ -69,7 +72,8 @@ def tuning_page(page: TuningPage) -> Figure:
             5, 2, figure=figure, height_ratios=rows, hspace=0.42, wspace=0.24,
             left=0.085, right=0.975, top=0.945, bottom=0.015,
         )  # fmt: skip
-        figure.suptitle(page.title, x=0.085, y=0.985, ha="left", fontsize=11, fontweight="bold")
+        figure.text(0.085, 0.987, page.title, va="top", fontsize=11, fontweight="bold")
+        figure.text(0.085, 0.968, page.subtitle, va="top", color=GREY)
         _draw_errors(figure.add_subplot(grid[0, 0]), page.errors)
         losses = figure.add_subplot(grid[0, 1])
         draw_losses(losses, page.training, page.heldout, page.best)
@@ -143,10 +147,13 @@ def _draw_parameters(figure: Figure, grid: GridSpec, page: TuningPage) -> None:
     kinds = [kind for kind in kinds if kind]
     correlation = page.correlation
     known = correlation is not None and len(correlation) > 1
-    longest = max((len(each.name) for each in page.estimates), default=0)
-    names = max(0.0, 0.055 * longest - 0.35)  # [inch] of the names that the margin does not hold
-    values, matrix = 1.35, 2.3 if known else 0.0  # [inch]
-    widths = names, 7.1 - names - values - matrix - 0.055 * longest, values, 0.055 * longest, matrix
+    # Widths [inch]: of names beyond what the margin holds, the chart, its values, names, matrix.
+    left, right = (
+        CHARACTER_WIDTH * max((len(text(each)) for each in page.estimates), default=0)
+        for text in (lambda each: each.label, lambda each: each.name)
+    )
+    left, values, matrix = max(0.0, left - 0.35), 1.35, 2.3 if known else 0.0
+    widths = left, 7.1 - left - values - right - matrix, values, right, matrix
     outer = grid[3, :].subgridspec(1, 5, width_ratios=np.maximum(widths, 0.01), wspace=0.0)
     inner = outer[1].subgridspec(
         max(len(kinds), 1), 1, height_ratios=[len(kind) + 1 for kind in kinds] or None, hspace=0.5

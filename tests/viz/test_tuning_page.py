@@ -24,7 +24,7 @@ def report(scale, *, truth=True):
 
 
 ESTIMATES = [
-    Estimate("range", 0.1, 0.02, 0.1),
+    Estimate("range", 0.1, 0.02, 0.1, unit="m"),
     Estimate("bearing", 0.1, 0.05, np.inf, identifiable=False),
     Estimate("wall", 0.1, 0.1, frozen=True),
     Estimate("mount[0]", 0.0, 0.25, 0.01, positive=False),
@@ -34,6 +34,7 @@ ESTIMATES = [
 def page(**changes):
     whole = TuningPage(
         title="a tuning",
+        subtitle="evaluated on others",
         before=report(4.0),
         after=report(1.0),
         estimates=ESTIMATES,
@@ -62,7 +63,15 @@ def drawn():
 
 def test_the_page_says_what_changed_and_what_is_found(drawn):
     words = texts(drawn)
-    assert {"a tuning", "position RMSE [m]", "0.4", "0.1", "-75%", "Findings before"} < set(words)
+    assert {
+        "a tuning",
+        "evaluated on others",
+        "position RMSE [m]",
+        "0.4",
+        "0.1",
+        "-75%",
+        "Findings before",
+    } < set(words)
     assert "not identifiable: bearing" in words and "Warnings" in words
     assert any(text.startswith("Q and R too small, by a common factor of 4") for text in words)
     assert any(text.startswith("consistent: NIS per dof ") for text in words)
@@ -141,7 +150,11 @@ def test_intervals_of_positive_parameters_are_those_of_their_logarithm():
     axis = canvas.canvas(4.0, 3.0)[1][0, 0]
     draw_estimates(axis, ESTIMATES[:3])
     assert axis.get_xscale() == "log"
-    assert [label.get_text() for label in axis.get_yticklabels()] == ["range", "bearing", "wall"]
+    assert [label.get_text() for label in axis.get_yticklabels()] == [
+        "range [m]",
+        "bearing",
+        "wall",
+    ]
     axis = canvas.canvas(4.0, 3.0)[1][0, 0]
     draw_estimates(axis, ESTIMATES[3:])
     assert axis.lines[-1].get_xdata()[0] == pytest.approx(25.0), "standard errors"

@@ -78,8 +78,10 @@ def verdicts_of(
 
 
 def _mean_text(name: str, fit: ChiSquareFit) -> str:
+    """Mean per degree of freedom, with half of its 95 % interval and as many digits as that has."""
     half = NORMAL_QUANTILE * fit.std_error
-    return f"{name} per dof {fit.per_dof:.2f} (1 expected, +- {half:.2f})"
+    digits = int(np.clip(-np.floor(np.log10(half)), 2, 4)) if half > 0.0 else 2
+    return f"{name} per dof {fit.per_dof:.{digits}f} (1 expected, +- {half:.{digits}f})"
 
 
 def _bias_scores(white: Whiteness) -> np.ndarray:

@@ -212,6 +212,7 @@ def test_histograms_count_what_chi_square_expects():
     nis = np.where(dof > 0, rng.chisquare(np.maximum(dof, 1)), np.nan)
     report = consistency_of_nis(nis, dof)
     assert report.consistent and report.nis.num_values == np.sum(dof > 0)
+    assert report.nis.per_dof == pytest.approx(np.nansum(nis) / dof.sum())
     for degrees in (None, 1, 6):
         edges, counts, expected = histogram(report.nis, degrees)
         number = np.sum(dof > 0) if degrees is None else np.sum(dof == degrees)

@@ -29,6 +29,7 @@ from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.heteroscedastic import MeasurementWeights, incidence
 from jaxslam.filtering.measurement_model import measure, predict_measurement, residual
 from jaxslam.filtering.noise import NoiseParams, measurement_cov
+from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import trials
@@ -115,6 +116,9 @@ def scans(seed: int, num_trials: int, num_heldout: int, num_scans: int | None) -
             "measurement_weights.clearance[2]",
         ),
     )
+
+
+WORLDS = {"exact": exact, "scans": scans}
 
 
 def compare(name: str, task: Task, num_updates: int, cache: common.ResultCache) -> common.Numbers:
@@ -229,7 +233,7 @@ def _mean(values: np.ndarray) -> common.Numbers:
 
 def draw(numbers: common.Numbers, path: Path) -> None:
     """NEES over incidence of both kinds of noise, in each world."""
-    shown = [name for name in ("exact", "scans") if name in numbers]
+    shown = [name for name in WORLDS if name in numbers]
     figure, axes = common.canvas(6.0 * len(shown), 4.2, 1, len(shown))
     for axis, name in zip(axes[0], shown, strict=True):
         key = "range_nees_over_incidence" if name == "exact" else "pose_nees_over_incidence"
@@ -255,21 +259,27 @@ def _draw_nees(axis: Any, found: common.Numbers, key: str) -> None:
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    args = common.parse(__doc__, argv, runs=32, heldout=64, scans=0, chain=1, updates=25)
+    args = common.parse(
+        __doc__, argv, runs=32, heldout=64, scans=0, updates=25, worlds="exact,scans"
+    )
+    worlds = args.worlds.split(",")
+    if not set(worlds) <= set(WORLDS):
+        raise InputError(
+            f"is {args.worlds!r}", field="--worlds", advice="give exact, scans or both"
+        )
     use_cpu_devices()
     enable_caches()
     about = {key: str(value) for key, value in vars(args).items() if key != "out"}
     cache = common.ResultCache(args.out / f"{NAME}_parts", about)
     count = args.scans or None
     numbers: common.Numbers = {"seed": args.seed, "growth": GROWTH}
-    for name, make in (("exact", exact), ("scans", scans))[: 1 + bool(args.chain)]:
-        task = make(args.seed, args.runs, args.heldout, count)
+    for name in worlds:
+        task = WORLDS[name](args.seed, args.runs, args.heldout, count)
         numbers[name] = compare(name, task, args.updates, cache)
     common.save(args.out, NAME, numbers, draw)
     cache.clear()
-    for name in ("exact", "scans"):
-        if name in numbers:
-            print(line(name, numbers[name]))
+    for name in worlds:
+        print(line(name, numbers[name]))
     return 0
 
 
@@ -299,4 +309,4 @@ def line(name: str, found: common.Numbers) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

@@ -53,6 +53,7 @@ def measurements():
     return jax.tree.map(lambda x: x[0], drives[1])
 
 
+@pytest.mark.slow
 def test_neutral_options_change_nothing(measurements):
     plain = landmark_drives.CONFIG
     start = init(plain, ZERO)
@@ -66,6 +67,7 @@ def test_neutral_options_change_nothing(measurements):
     assert info.odometry_bias is None and info.noise_factors is None
 
 
+@pytest.mark.slow
 def test_derivatives_by_every_parameter_are_those_of_differences(measurements):
     params = options(
         odometry_cov_rate=1e-4 * jnp.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 1.5]]),

@@ -72,15 +72,6 @@ def test_a_scale_error_is_tracked_and_the_covariance_is_right(drives, beliefs):
     assert abs(((scale - 0.03) ** 2 / std**2).mean() - 1.0) < 4 * np.sqrt(2 / TRIALS)
 
 
-def test_without_the_states_the_same_drives_are_inconsistent(drives):
-    belief = filtered(landmark_drives.CONFIG, landmark_drives.PARAMS, drives[1])[0]
-    assert belief.bias is None
-    pose = np.asarray(belief.pose[:, :2] - drives[0][:, -1, :2])
-    P = np.asarray(belief.pose_cov[:, :2, :2])
-    nees = np.einsum("bi,bij,bj->b", pose, np.linalg.inv(P), pose)
-    assert nees.mean() > 2 + 10 * np.sqrt(4 / TRIALS)
-
-
 def test_biases_that_are_certain_change_nothing(drives):
     """And they stay zero: a wider block of zeros."""
     one = jax.tree.map(lambda x: x[:1], drives[1])
@@ -95,15 +86,16 @@ def test_biases_that_are_certain_change_nothing(drives):
 
 def test_the_model_is_the_calibration_of_the_robot():
     bias = jnp.array([0.1, -0.2, 0.3])
-    straight = correct_odometry(bias, jnp.array([0.5, 0.0, 0.0]))
+    correct = jax.jit(correct_odometry)
+    straight = correct(bias, jnp.array([0.5, 0.0, 0.0]))
     turn = 0.3 * 0.5
     arc = 1.1 * 0.5 * np.sinc(turn / 2 / np.pi)
     expected = [arc * np.cos(turn / 2), arc * np.sin(turn / 2), turn]
     np.testing.assert_allclose(straight, expected, rtol=1e-12)
-    on_the_spot = correct_odometry(bias, jnp.array([0.0, 0.0, 0.5]))
+    on_the_spot = correct(bias, jnp.array([0.0, 0.0, 0.5]))
     np.testing.assert_allclose(on_the_spot, [0.0, 0.0, 0.4], atol=1e-15)
-    np.testing.assert_allclose(correct_odometry(0 * bias, jnp.array([0.3, 0.1, 0.2]))[2], 0.2)
-    jacobian = jax.jacobian(correct_odometry, argnums=(0, 1))(bias, jnp.zeros(3))
+    np.testing.assert_allclose(correct(0 * bias, jnp.array([0.3, 0.1, 0.2]))[2], 0.2)
+    jacobian = jax.jit(jax.jacobian(correct, argnums=(0, 1)))(bias, jnp.zeros(3))
     assert all(np.isfinite(x).all() for x in jacobian)
 
 

@@ -96,6 +96,7 @@ def test_a_weight_is_that_of_the_own_innovation():
 def test_derivatives_are_those_of_differences():
     cov, rows = problem()
 
+    @jax.jit
     def value(nu, R, residual):
         own = rows._replace(R=R, residual=residual)
         found, score = robust.reweight(nu, cov, own, SIZE)
@@ -111,6 +112,7 @@ def test_a_matrix_that_is_not_definite_scores_nothing():
     assert score.log_likelihood == 0.0 and score.nis == 0.0
 
 
+@pytest.mark.slow
 def test_an_outlier_moves_the_robust_filter_less():
     several = landmark_drives.drives(jax.random.key(0), count=1, steps=12)[1]
     measurements = jax.tree.map(lambda x: x[0], several)

@@ -44,7 +44,7 @@ CONFIG = Config(
 def true_params() -> NoiseParams:
     """Q and R that the drives are simulated with."""
     return NoiseParams(
-        odometry_coefficients=jnp.asarray(wheel_coefficients(*Robot()), float),
+        odometry_coefficients=jnp.asarray(wheel_coefficients(*Robot()[:2]), float),
         range_std=jnp.asarray(0.01, float),
         bearing_std=jnp.asarray(0.005, float),
         feature_std_scale=jnp.asarray(1.0, float),

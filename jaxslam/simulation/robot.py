@@ -42,7 +42,8 @@ class Robot(NamedTuple):
         wheels = Calibration.of_wheels(
             left, right, self.wheel_base_scale, wheel_base=self.wheel_base
         )
-        whole = wheels._replace(mount=self.mount, time_offset=self.time_offset)
+        mount, time_offset = np.asarray(self.mount), np.asarray(self.time_offset)
+        whole = wheels._replace(mount=mount, time_offset=time_offset)
         return Calibration(*(np.asarray(x, float) for x in whole))
 
 

@@ -102,7 +102,7 @@ def measure(key: Key, params: NoiseParams, positions: Array, pose: Array) -> tup
     error = jnp.einsum("mij,mj->mi", roots, jax.random.normal(keys[1], exact.shape, exact.dtype))
     one = jnp.ones_like(scale)  # a wall's direction is one number
     error = error * jnp.stack([one, jnp.where(kind == JUNCTION, one, 0.0)], axis=1)
-    ids = jnp.append(order, jnp.int32(NUM_LANDMARKS))
+    ids = jnp.append(order, jnp.int32(len(positions)))
     return zero_padding(features(exact + error)), jnp.where(valid, ids, -1)
 
 

@@ -6,7 +6,7 @@ A loss takes the step infos [T] of the filter and the episode that it ran on, an
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jaxslam.core.types import Array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, pose_error
 from jaxslam.filtering.slam_filter import StepInfo
 
-Loss = Callable[[StepInfo, Episode], Array]
+Loss = Callable[[Any, Any], Array]
 
 # [m^2 / rad^2] weight of a squared heading error, relative to a squared position error
 HEADING_WEIGHT = 1.0
@@ -112,6 +112,11 @@ def name_of(loss: Loss) -> str:
     raise ValueError(f"{loss!r} is none of {', '.join(BY_NAME)}")
 
 
+def default_loss(data: Any) -> Loss:
+    """The loss that is minimised where none is named, by the data: `pose_nll` of episodes."""
+    return pose_nll if isinstance(data, Episode) else innovation_nll
+
+
 def needs_truth(loss: Loss) -> bool:
     """Whether a loss of this module, or a sum of them, needs ground truth."""
     if isinstance(loss, WeightedLoss):
@@ -119,12 +124,12 @@ def needs_truth(loss: Loss) -> bool:
     return loss in (pose_mse, pose_nll)
 
 
-def check_loss(loss: Loss, episodes: Episode, *, name: str = "episodes") -> None:
-    """Check, before any work starts, that a loss can be evaluated on episodes [B].
+def check_loss(loss: Loss, data: Any, *, name: str = "episodes") -> None:
+    """Check, before any work starts, that a loss can be evaluated on data [B].
 
     Args:
         loss: The loss.
-        episodes: [B] episodes, as `inputs.as_episodes` returns them.
+        data: [B] sequences; episodes as `inputs.as_episodes` returns them.
         name: What they are called in the error message.
 
     Raises:
@@ -136,10 +141,14 @@ def check_loss(loss: Loss, episodes: Episode, *, name: str = "episodes") -> None
         raise ValueError(f"loss is {loss!r}, not a function of step infos and an episode; {named}")
     if isinstance(loss, WeightedLoss) and not loss.terms:
         raise ValueError("loss is a WeightedLoss without terms")
-    if not np.size(episodes.odometry):
+    if not isinstance(data, Episode):
+        if needs_truth(loss):
+            raise ValueError(f"loss {loss!r} is of episodes, which {name} are not")
+        return
+    if not np.size(data.odometry):
         raise ValueError(f"{name}: no episodes, or none with a step")
-    if needs_truth(loss) and episodes.truth_mask is not None:
-        missing = np.flatnonzero(~np.asarray(episodes.truth_mask).any(axis=1))
+    if needs_truth(loss) and data.truth_mask is not None:
+        missing = np.flatnonzero(~np.asarray(data.truth_mask).any(axis=1))
         if missing.size:
             raise ValueError(
                 f"{name}: episode {missing[0]} has no reference, which this loss needs; give one, "

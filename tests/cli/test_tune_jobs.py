@@ -156,7 +156,7 @@ def test_an_interrupt_before_the_first_evaluation_leaves_nothing(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(tune_command, "enable_caches", lambda: None)
-    monkeypatch.setattr(fitting, "gradients", stop)
+    monkeypatch.setattr(fitting, "gradients_of", stop)
     assert main.main(["tune", str(drives), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "jaxslam: interrupted, nothing written"
     assert [file.name for file in tmp_path.iterdir()] == ["drives"]
@@ -170,7 +170,7 @@ def test_an_interrupt_during_the_evaluation_says_where_the_noise_is(
 
     values = np.array([1.0]), np.full((1, 8), 0.5)
     monkeypatch.setattr(tune_command, "enable_caches", lambda: None)
-    monkeypatch.setattr(fitting, "gradients", lambda *_: values)
+    monkeypatch.setattr(fitting, "gradients_of", lambda *_: values)
     monkeypatch.setattr(fitting, "values", stop)
     out = tmp_path / "out"
     assert main.main(["tune", str(drives), "--updates", "2", "--out", str(out)]) == 130

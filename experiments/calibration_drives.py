@@ -7,6 +7,7 @@ walls, each with a draw of the filter's own measurement noise.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,10 @@ import numpy as np
 
 from experiments import exact_model
 from jaxslam.core.episode import Episode
-from jaxslam.core.types import Array, Key
+from jaxslam.core.types import JUNCTION, WALL, Array, Key
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.motion_model import wheel_coefficients
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.core.types import JUNCTION, WALL
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import path_following, trials
 from jaxslam.simulation.drives import drive, num_scans_of_drive
@@ -77,10 +77,12 @@ def _drives(
     return jax.lax.map(one, trials.trial_keys(key, jnp.arange(num_trials)))
 
 
-def drives(key: Key, robot: Robot, *, num_trials: int, waypoints=None) -> Episode:
-    """B drives of a robot along waypoints (K, 2) [m], `ROOM` by default; NumPy arrays."""
-    path = jnp.asarray(path_following.densify(ROOM if waypoints is None else waypoints), float)
-    count = num_scans_of_drive(robot, path)
-    positions = jnp.asarray(LANDMARKS, path.dtype)
-    made = _drives(key, robot, path, positions, num_trials=num_trials, num_scans=count)
+def drives(
+    key: Key, robot: Robot, *, num_trials: int, path: Any = ROOM, num_scans: int | None = None
+) -> Episode:
+    """B drives of a robot along a path, given by waypoints (K, 2) [m]; NumPy arrays."""
+    points = jnp.asarray(path_following.densify(path), float)
+    count = num_scans_of_drive(robot, points) if num_scans is None else num_scans
+    positions = jnp.asarray(LANDMARKS, points.dtype)
+    made = _drives(key, robot, points, positions, num_trials=num_trials, num_scans=count)
     return jax.tree.map(np.asarray, made)

@@ -33,7 +33,7 @@ from jaxslam.tuning.model import Model
 from jaxslam.tuning.priors import Prior
 from jaxslam.tuning.slam_model import SlamCheck
 
-SHAPES = Calibration((), (), (), (3,), ())  # of the fields
+SHAPES = {"mount": (3,)}  # of fields that are no scalars
 
 
 class CalibratedParams(NamedTuple):
@@ -54,12 +54,9 @@ def default_prior() -> CalibratedParams:
     Scales within 5 %, drift within 0.1 rad/m, the mount within 10 cm and 0.05 rad of where it was
     taken to be, clocks within 0.1 s.
     """
-    mount_std = np.array([0.1, 0.1, 0.05])
-    calibration = Calibration(
-        *(Prior(1.0, 0.05), Prior(1.0, 0.05), Prior(0.0, 0.1)),
-        *(Prior(0.0, mount_std), Prior(0.0, 0.1)),
-    )
-    return CalibratedParams(cast(Any, None), calibration)
+    mount = Prior(0.0, np.array([0.1, 0.1, 0.05]))
+    own = Prior(1.0, 0.05), Prior(1.0, 0.05), Prior(0.0, 0.1), mount, Prior(0.0, 0.1)
+    return CalibratedParams(*cast(Any, (None, Calibration(*cast(Any, own)))))
 
 
 class _Init(NamedTuple):
@@ -110,9 +107,12 @@ class _Check(NamedTuple):
     ) -> tuple[CalibratedParams, Episode]:
         check_type("params", params, CalibratedParams)
         check_type("params.calibration", params.calibration, Calibration)
-        given = zip(Calibration._fields, params.calibration, SHAPES, strict=True)
-        fields = (as_float(f"params.calibration.{field}", x, shape) for field, x, shape in given)
-        calibration = Calibration(*fields)
+        calibration = Calibration(
+            *(
+                as_float(f"params.calibration.{field}", x, SHAPES.get(field, ()))
+                for field, x in params.calibration._asdict().items()
+            )
+        )
         noise, stacked = cast(Any, self.noise)(params.noise, episodes, name)
         return CalibratedParams(noise, calibration), stacked
 
@@ -136,9 +136,7 @@ def calibrate_episode(
     times = None
     if scan_period is not None:
         times = scan_period * jnp.arange(count, dtype=episode.odometry.dtype)
-    odometry = calibrate_odometry(
-        calibration, episode.odometry, times=times, wheel_base=wheel_base
-    )
+    odometry = calibrate_odometry(calibration, episode.odometry, times=times, wheel_base=wheel_base)
     return episode._replace(odometry=odometry)
 
 

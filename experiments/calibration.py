@@ -157,12 +157,13 @@ def compute_loss(
     for number in tqdm(range(starts), unit="start", desc=loss, leave=False):
         make = partial(recover, loss, start_of(seed, number), hessian, train, test)
         rows.append(cache(f"{loss} start {number}", make))
-    best = parameters.unflatten_params(min(rows, key=lambda x: x["loss"])["theta"], true_params())
-    errors = cache(f"{loss} standard errors", partial(_errors, loss, best, train))
+    theta = min(rows, key=lambda row: row["loss"])["theta"]
+    found = parameters.unflatten_params(theta, true_params())
+    errors = cache(f"{loss} standard errors", partial(_errors, loss, found, train))
     se = np.array([np.nan if x is None else x for x in errors["relative"]])
     repeated = []
     for number in tqdm(range(repetitions), unit="repetition", desc=loss, leave=False):
-        make = partial(_repeat, loss, seed, number, best, hessian)
+        make = partial(_repeat, loss, seed, number, found, hessian)
         repeated.append(cache(f"{loss} repetition {number}", make)["theta"])
     off = np.array([row["theta"] for row in rows]) - truth
     own = np.arange(len(truth)) >= NOISE_NUMBERS
@@ -171,10 +172,17 @@ def compute_loss(
     smaller = np.sqrt(len(train.odometry) / PART)
     spread = np.std(repeated, axis=0, ddof=1) if repetitions > 1 else np.full(len(truth), np.nan)
     z = off / se
+    best = min(range(starts), key=lambda i: rows[i]["loss"])
+    apart = (off - off[best])[:, shown] / se[shown]
+    others = (np.array(repeated).reshape(-1, len(truth)) - truth)[:, shown] / (smaller * se[shown])
     return {
         "loss": loss,
         "starts": starts,
         "within_3_se": int(np.sum(np.all(np.abs(z[:, shown]) < 3.0, axis=1))),
+        "z": z[best],
+        "starts_apart_se": float(np.abs(apart).max(initial=0.0)),
+        "repetitions_within_3_se": int(np.sum(np.all(np.abs(others) < 3.0, axis=1))),
+        "repetitions_mean_z": others.mean(axis=0) if repetitions else [],
         "worst_z": float(np.abs(z[:, shown]).max(initial=0.0)),
         "known_calibration_rmse_m": known["heldout_rmse_m"],
         "heldout_ratio": [float(ratio.min()), float(ratio.max())],
@@ -330,7 +338,11 @@ def main(argv: list[str] | None = None) -> int:
     common.save(args.out, NAME, numbers, draw)
     cache.clear()
     for row in rows:
-        print({key: row[key] for key in ("loss", "starts", "within_3_se", "worst_z", "warnings")})
+        print({key: row[key] for key in ("loss", "starts", "within_3_se", "worst_z")})
+        print("  starts are apart by at most", row["starts_apart_se"], "standard errors")
+        repeated = row["repetitions_within_3_se"]
+        print(f"  repetitions within 3 standard errors: {repeated} of {row['repetitions']}")
+        print("  warnings:", *row["warnings"])
         print("  held-out RMSE per that of the known calibration:", row["heldout_ratio"])
         for name, ratio in zip(row["names"], row["error_per_spread"], strict=True):
             if name.startswith("calibration."):

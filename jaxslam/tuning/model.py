@@ -87,5 +87,5 @@ def run_model(model: Model, params: Any, sequence: Any) -> tuple[Any, Any]:
 def num_steps(model: Model, params: Any, data: Any) -> int:
     """Number T of steps of the sequences of data [B]."""
     sequence = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], x.dtype), data)
-    inputs = jax.eval_shape(model.inputs, params, sequence)
+    inputs = jax.eval_shape(lambda *given: model.inputs(*given), params, sequence)
     return jax.tree.leaves(inputs)[0].shape[0]

@@ -138,6 +138,7 @@ def draw_report(
         best=found.best,
         errors=[row for row in rows if row[1] is not None and row[2] is not None],
         notes=numbers["warnings"],
+        series="corrections of the pose by the features",
     )
     canvas.save(tuning_page(page), path)
 

@@ -80,6 +80,8 @@ def verdicts_of(
 def _mean_text(name: str, fit: ChiSquareFit) -> str:
     """Mean per degree of freedom, with half of its 95 % interval and as many digits as that has."""
     half = NORMAL_QUANTILE * fit.std_error
+    if not np.isfinite(half):
+        return f"{name} per dof {fit.per_dof:.2f} (1 expected, of a single step)"
     digits = int(np.clip(-np.floor(np.log10(half)), 2, 4)) if half > 0.0 else 2
     return f"{name} per dof {fit.per_dof:.{digits}f} (1 expected, +- {half:.{digits}f})"
 
@@ -144,7 +146,7 @@ def _nis_lines(
     if abs(nis.score) < SIGNIFICANT:
         return []
     text, part = _mean_text("NIS", nis), _bias_part(nis, white, biased)
-    if part > 0.5 * max(nis.per_dof - 1.0, 0.0) and size <= 0:
+    if nis.per_dof > 1.0 and size <= 0 and part > 0.5 * (nis.per_dof - 1.0):
         return [f"innovations too large by their bias: {text}, {part:.2f} of it the bias"]
     slightly = "slightly " if abs(nis.per_dof - 1.0) < SLIGHT else ""
     which = "large" if nis.per_dof > 1.0 else "small"
@@ -205,11 +207,16 @@ def _shape_lines(fit: ChiSquareFit, name: str) -> list[str]:
 
 
 def _time_lines(white: Whiteness | None, nis_white: Whiteness) -> list[str]:
-    """Noise whose size varies in time: large innovations follow large ones."""
-    if nis_white.ljung_box_p >= P_VALUE or not _sign(nis_white) > 0:
+    """Noise whose size varies in time: large innovations follow large ones.
+
+    Innovations with the correlation r have squares with r^2, which is no finding of its own.
+    """
+    if nis_white.ljung_box_p >= P_VALUE or _sign(nis_white) <= 0:
         return []
     if white is not None and (_sign(white) or white.ljung_box_p < P_VALUE):
-        return []  # innovations that are correlated have squares that are
+        excess = nis_white.autocorrelation[0, 1] - np.nanmax(white.autocorrelation[:, 1] ** 2)
+        if not excess > max(SLIGHT, SIGNIFICANT / np.sqrt(nis_white.num_pairs[0, 1])):
+            return []
     slightly, where = _correlation_text(nis_white)
     cause = "noise that varies in time, or correlated innovations"
     return [f"NIS is {slightly}correlated {where}; {cause}"]

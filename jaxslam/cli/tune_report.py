@@ -127,7 +127,7 @@ def draw_report(
     before = numbers["before"]
     rows = [(name, before.get(key), numbers.get(key)) for key, name in ERRORS]
     page = TuningPage(
-        title=title,
+        title=f"Tuning of Q and R: {title}",
         subtitle=f"{numbers['evaluations']} evaluations; evaluated on {numbers['judged_on']}",
         before=report.before,
         after=report.after,

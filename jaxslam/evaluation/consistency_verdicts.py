@@ -132,11 +132,16 @@ def _correlation_text(white: Whiteness) -> tuple[str, str]:
     band = abs(2.0 * mean / score)
     lags = "lag 1" if last == 1 else f"lags 1 to {last}, mean"
     slightly = "slightly " if abs(mean) < SLIGHT else ""
-    return slightly, f"at {lags}: {white.names[k]} {mean:+.2f} (0 expected, +- {band:.2f})"
+    name = f" {white.names[k]}" if len(white.names) > 1 else ""
+    return slightly, f"at {lags}:{name} {mean:+.2f} (0 expected, +- {band:.2f})"
 
 
-def _cause(size: int, sign: int, per_dof: float) -> str:
-    return CAUSES[size, sign].format(factor=per_dof, inverse=1.0 / max(per_dof, 1e-12))
+def _cause(white: Whiteness, size: int, sign: int, per_dof: float) -> str:
+    """Likely cause; a slight correlation does not say how much both Q and R are off."""
+    text = CAUSES[size, sign].format(factor=per_dof, inverse=1.0 / max(per_dof, 1e-12))
+    if size and sign and abs(_correlation(white).mean) < SLIGHT:
+        return f"{text}, perhaps {'Q' if text.startswith('R') else 'R'}, too"
+    return text
 
 
 def _nis_lines(
@@ -153,7 +158,7 @@ def _nis_lines(
     if white is None:
         cause = "Q or R too small" if nis.per_dof > 1.0 else "Q or R too large"
     else:
-        cause = _cause(size, sign, nis.per_dof - part)
+        cause = _cause(white, size, sign, nis.per_dof - part)
     return [f"{cause}: innovations are {slightly}too {which}, {text}"]
 
 

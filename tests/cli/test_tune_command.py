@@ -152,7 +152,7 @@ def test_consistency_parameters_and_correlations_are_written(done):
     numbers = done.numbers
     before, after = (numbers["consistency"][when] for when in ("before", "after"))
     assert abs(np.log(after["nis_per_dof"])) < abs(np.log(before["nis_per_dof"]))
-    assert before["nis_count"] == after["nis_count"] == 19, "every second of 39 steps has features"
+    assert before["nis_count"] == after["nis_count"] > 30
     assert after["nees_per_dof"] == pytest.approx(numbers["nees"], rel=1e-4)
     assert list(after["autocorrelation"]) == ["heading", "to the left", "ahead"]
     for series in after["autocorrelation"].values():

@@ -71,10 +71,10 @@ def test_a_correct_filter_is_consistent_in_standard_errors():
 @pytest.mark.parametrize(
     "wrong, cause, sign",
     [
-        ({"q": 0.02}, "Q too small, or noise that is itself correlated: innovations are too", 1),
-        ({"q": 50.0}, "Q too large: innovations are too small", -1),
-        ({"r": 0.2}, "R too small: innovations are too large", -1),
-        ({"r": 5.0}, "R too large, or noise that is itself correlated: innovations are too", 1),
+        ({"q": 0.02}, "Q too small, or noise that is itself correlated", 1),
+        ({"q": 50.0}, "Q too large", -1),
+        ({"r": 0.2}, "R too small", -1),
+        ({"r": 5.0}, "R too large, or noise that is itself correlated", 1),
         ({"q": 0.5, "r": 0.5}, "Q and R too small, by a common factor of 2", 0),
         ({"q": 3.0, "r": 3.0}, "Q and R too large, by a common factor of 2.", 0),
         ({"q": 1.0, "neighbours": 0.7}, "R too large, or noise that is itself correlated", 1),

@@ -119,7 +119,7 @@ def test_noise_json_agrees_with_metrics_json_and_can_be_read_back(done):
     numbers = done.numbers["noise"]
     assert list(numbers) == FILE_KEYS
     assert list(done.numbers["before"]["noise"]) == list(numbers)
-    for name, value in zip(numbers, found, strict=True):
+    for name, value in noise_file.to_keys(found).items():
         assert (value is None) == (numbers[name] is None)
         if value is not None:
             np.testing.assert_allclose(value, numbers[name], rtol=1e-6)

@@ -268,13 +268,11 @@ def _evaluate(
         keys = map(noise_file.key_of, sure.names)
         numbers["standard_errors"] = dict(zip(keys, sure.relative.tolist(), strict=True))
         numbers["warnings"] = list(sure.warnings)
-    names, values = tune_report.numbers_of(found.params)
     report = tune_report.TuneReport(
         before=before,
         after=after,
-        names=names,
-        start=tune_report.numbers_of(job.params)[1],
-        found=values,
+        start=job.params,
+        found=found.params,
         frozen=~parameters.trainable_mask(found.params, settings.frozen),
         errors=sure,
     )

@@ -30,7 +30,7 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import mrclam
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
-from jaxslam.tuning import BY_NAME, fitting, parameters, standard_errors
+from jaxslam.tuning import BY_NAME, fitting, nis_consistency, parameters, standard_errors
 
 NAME = "identifiability"
 UPDATES = 25
@@ -40,9 +40,10 @@ SCALE = 1.03  # of the odometry's distances
 LASTING_STD, LASTING_STEPS = 0.03, 20  # [m] and steps, of an error of the range that lasts
 STUDENT_DOF = 4.0  # of the filter that is tuned on MRCLAM
 ROBOTS = (1, 2, 3, 4, 5)
+LOSSES = {**BY_NAME, "nis_consistency": nis_consistency}
 COLOURS = dict(
     zip(
-        BY_NAME,
+        LOSSES,
         (common.BLACK, common.SKY, common.PINK, common.GREEN, common.ORANGE, common.BLUE),
         strict=False,
     )
@@ -112,8 +113,8 @@ def recover(loss: str, train: Episode, test: Episode) -> common.Numbers:
     off = np.log(START) * np.where(np.arange(exact.size) % 2, -1.0, 1.0)
     start = parameters.unflatten_params(exact + off, truth)
     config = exact_model.CONFIG
-    found = fitting.tune(config, start, train, loss=loss, num_updates=UPDATES)
-    sure = standard_errors.standard_errors(config, found.params, train, loss=loss)
+    found = fitting.tune(config, start, train, loss=LOSSES[loss], num_updates=UPDATES)
+    sure = standard_errors.standard_errors(config, found.params, train, loss=LOSSES[loss])
     return {
         "log_ratio": parameters.flatten_params(found.params) - exact,
         "standard_errors": sure.relative,
@@ -187,7 +188,7 @@ def _simulated(args: Any, cache: common.ResultCache) -> list[common.Numbers]:
         jax.random.key(args.seed), truth, num_trials=total, num_scans=args.scans or None
     )
     rows = []
-    work = [(loss, error) for loss in BY_NAME for error in ERRORS]
+    work = [(loss, error) for loss in LOSSES for error in ERRORS]
     for loss, error in tqdm(work, leave=False, unit="tuning"):
         hurt = ERRORS[error](drives, args.seed)
         parts = [common.take(hurt, part) for part in (slice(args.runs), slice(args.runs, total))]

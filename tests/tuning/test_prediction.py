@@ -214,12 +214,10 @@ def test_losses_that_predict_check_their_data(robot):
         fitting.values(CONFIG, NOISE, drives, two)
 
 
-def test_a_sum_gives_each_loss_what_it_needs(robot):
-    drive, ids = robot
-    drives = stack_episodes([drive(ids), drive(ids)])
-    both = WeightedLoss(((1.0, ClosureNll(5)), (0.5, innovation_nll)))
-    closure, innovations, found = (
-        fitting.values(CONFIG, NOISE, drives, loss)
-        for loss in (ClosureNll(5), innovation_nll, both)
-    )
-    np.testing.assert_allclose(found, closure + 0.5 * innovations, rtol=1e-9)
+def test_a_sum_gives_each_loss_what_it_needs(sequence):
+    both = WeightedLoss(((1.0, PredictionNll(PART)), (0.5, innovation_nll)))
+    _, info = run_model(run_twice(LINE, PredictionNll(PART)), PARAMS, sequence)
+    expected = PredictionNll(PART)(info, sequence) + 0.5 * innovation_nll(info.whole, sequence)
+    np.testing.assert_allclose(both(info, sequence), expected, rtol=1e-12)
+    data = jax.tree.map(lambda x: x[None], sequence)
+    np.testing.assert_allclose(fitting.values(LINE, PARAMS, data, both)[0], expected, rtol=1e-9)

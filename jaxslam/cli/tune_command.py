@@ -66,7 +66,9 @@ def tune(
     world: str = "office",
     trials: int = 32,
     heldout: int = 16,
-    loss: Literal["pose_nll", "pose_mse", "innovation_nll"] = "pose_nll",
+    loss: Literal[
+        "pose_nll", "pose_mse", "innovation_nll", "prediction_nll", "closure_nll"
+    ] = "pose_nll",
     updates: int = 30,
     batch: OptionalCount = None,
     patience: OptionalCount = None,
@@ -103,8 +105,10 @@ def tune(
         heldout: Number of simulated held-out trials, for evaluation only.
         loss: Loss to minimise. pose_nll: negative log density of the true pose, which needs both
             accuracy and a consistent covariance; pose_mse: squared pose error alone, which leaves
-            the scale of the noise undetermined; innovation_nll: negative log-likelihood of the
-            innovations, the only one that needs no reference.
+            the scale of the noise undetermined. The others need no reference. innovation_nll:
+            negative log-likelihood of the innovations, for white noise; prediction_nll: that of the
+            map of each part of 64 steps, predicted from all before; closure_nll: that of landmarks
+            seen again after more than 64 steps; both for errors of the sensor that last.
         updates: Updates of the optimiser: L-BFGS, or Adam with --batch.
         batch: Episodes (logs or trials) per update (minibatch); by default all.
         patience: Stop after this many evaluations without improvement; by default never.

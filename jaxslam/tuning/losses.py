@@ -1,7 +1,8 @@
 """Losses for tuning Q and R by gradient: each is evaluated on one episode.
 
 A loss takes the step infos [T] of the filter and the episode that it ran on, and returns a number
-(). `fitting.tune` takes any function that does so; these are the usual ones. All are minimised.
+(). `fitting.tune` takes any function that does so; these are the usual ones, and those of
+`prediction`, which run the filter a second time. All are minimised.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +23,6 @@ from jaxslam.tuning.prediction import (
     Comparison,
     Memories,
     closure_nll,
-    nis_consistency,
     prediction_nll,
     run_twice,
 )
@@ -106,7 +106,6 @@ BY_NAME: Mapping[str, Loss] = MappingProxyType(
         "innovation_nll": innovation_nll,
         "prediction_nll": prediction_nll,
         "closure_nll": closure_nll,
-        "nis_consistency": nis_consistency,
     }
 )
 """The losses by name, as `jaxslam tune --loss` takes them."""

@@ -24,8 +24,9 @@ not seen for so many steps: two visits must meet.
 Where the filter fails, as where one landmark is taken for another, must not decide alone. With NIS
 and log-determinants S summed over windows of steps, each less that of p', a window counts
 
-    (rho(NIS) + log det S + n log 2 pi) / 2,    rho(x) = x              up to c, the quantile of 99.9 %
-                                                         c + c log(x/c) of chi-square, n dof; beyond
+    (rho(NIS) + log det S + n log 2 pi) / 2,      rho(x) = x up to c,  c + c log(x / c) beyond,
+
+c being the quantile of 99.9 % of chi-square with the n degrees of freedom of the window.
 
 References:
     Barratt, Boyd (2020), Fitting a Kalman smoother to data: prediction of what is held out. Cox

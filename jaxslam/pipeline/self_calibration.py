@@ -46,6 +46,9 @@ MATCH_STD_SCALE = 0.3
 MAX_TIMES_BACK = 0.01
 """Fraction of the time stamps that may run backwards, for the others to be trusted."""
 
+MIN_INTERVAL = 0.1
+"""Interval between two scans, of the median one, below which their stamps are those of a queue."""
+
 IRLS_ITERATIONS = 30
 
 LEFT_SIDEWAYS = 0.5
@@ -93,16 +96,18 @@ def calibrate_log(
     guessed = _guessed(given) | is_share
     taken = wheel_frame(odometry, log.mount, ~guessed) if mount is None else np.asarray(mount)
     times, before = usable_times(log.times), flat(calibration)
-    for number in range(1, MAX_ROUNDS + 1):
+    num_rounds, change = 0, np.full(len(before), np.inf)
+    limit = np.zeros(len(before))
+    while num_rounds < MAX_ROUNDS and np.any(change > limit):
+        num_rounds += 1
         moved = calibrate_odometry(calibration, odometry, times=times, mount=taken)
         matches = online.match_log(given.config, moved, given.scans, odometry_guessed=guessed)
         spans = motion_spans(given, odometry, matches, guessed, times, taken)
         estimate = estimate_calibration(spans, mean, prior_std)
         calibration = estimate.calibration
         change, before = np.abs(flat(calibration) - before), flat(calibration)
-        if np.all(change <= CONVERGED * flat(estimate.standard_errors)):
-            break
-    return LogCalibration(estimate, taken, number)
+        limit = CONVERGED * flat(estimate.standard_errors)
+    return LogCalibration(estimate, taken, num_rounds)
 
 
 def calibrated(
@@ -213,7 +218,7 @@ def motion_spans(
     motion = keyframes.compose_matches(matches, is_keyframe)
     inliers = np.asarray(matches.inlier_fraction)
     bad = guessed | given.after_pause | given.new_drive | (inliers < breaks.PAUSE_INLIERS)
-    bad |= ~np.asarray(matches.information).any(axis=(1, 2))
+    bad |= ~np.asarray(matches.information).any(axis=(1, 2)) | _in_queue(times)
     num_bad = np.cumsum(bad)
     reported = dead_reckoning(np.zeros(3), odometry)
     first, last = ends[:-1], ends[1:]
@@ -230,6 +235,21 @@ def motion_spans(
         driven=np.stack([np.hypot(gone[:, 0], gone[:, 1]), np.abs(gone[:, 2])], axis=1),
         usable=num_bad[last] == num_bad[first],
     )
+
+
+def _in_queue(times: np.ndarray) -> np.ndarray:
+    """Whether each of the scans (T,) was stamped at once with another, and not when it was taken.
+
+    By such a stamp, the robot would have driven a whole increment in no time.
+    """
+    interval = np.diff(times)
+    if not interval.any():
+        return np.zeros(len(times), bool)
+    short = np.flatnonzero(interval < MIN_INTERVAL * np.median(interval))
+    queued = np.zeros(len(times), bool)
+    for k in (0, 1, 2):  # the increments between both, before, and after
+        queued[np.minimum(short + k, len(times) - 1)] = True
+    return queued
 
 
 def _guessed(given: LogInput) -> np.ndarray:

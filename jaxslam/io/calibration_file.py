@@ -175,14 +175,14 @@ def _parse(path: str | PathLike, content: dict[str, Any]) -> RobotCalibration:
     errors = _calibration(path, "standard_errors", content["standard_errors"], positive)
     names, robot = content["not_determined"], content["robot"]
     _check_texts(path, "not_determined", names if isinstance(names, list) else [None])
-    keys = "num_beams", "angle_min", "angle_increment", "range_max"
-    _check_keys(path, "robot", robot, ("mount", "wheels", "base_frame", "scan_frame", *keys))
+    scanner = "num_beams", "angle_min", "angle_increment", "range_max"
+    _check_keys(path, "robot", robot, ("mount", "wheels", "base_frame", "scan_frame", *scanner))
     frames = robot["base_frame"], robot["scan_frame"]
     _check_texts(path, "robot.base_frame, robot.scan_frame", frames)
     limits = ((2, 10**6), (-10.0, 10.0), (1e-6, 4.0), (1e-3, 1e6))
     numbers = [
         float(_numbers(path, f"robot.{key}", robot[key], (), limit))
-        for key, limit in zip(keys, limits, strict=True)
+        for key, limit in zip(scanner, limits, strict=True)
     ]
     if numbers[0] != int(numbers[0]):
         problem = f"{numbers[0]} is no whole number"

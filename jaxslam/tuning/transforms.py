@@ -154,7 +154,14 @@ def bounded(low: float, high: float) -> Transform:
 CALIBRATION = Calibration._make([POSITIVE, POSITIVE, real(0.05), real((0.2, 0.2, 0.1)), real(0.1)])
 """Transforms of a `Calibration`; the scales are [rad / m], [m, m, rad] and [s]."""
 
-BY_FIELD: Mapping[str, Transform] = MappingProxyType({})
+BY_FIELD: Mapping[str, Transform] = MappingProxyType(
+    {
+        "odometry_cov_rate": CHOLESKY,
+        "odometry_weights": REAL,
+        "measurement_weights": REAL,
+        "custom": REAL,
+    }
+)
 """Transforms of fields of `NoiseParams` that are no standard deviations; others are positive."""
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxslam.cli.options import name_errors
 from jaxslam.cli.run_evaluation import RecordedDrive
-from jaxslam.core.calibration import calibrate_odometry
+from jaxslam.core.calibration import Calibration, calibrate_odometry
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.se2_np import compose, dead_reckoning, increments
 from jaxslam.core.types import Metrics
@@ -15,9 +15,16 @@ from jaxslam.evaluation import log_errors
 from jaxslam.io import calibration_file
 from jaxslam.io.calibration_file import RobotCalibration
 from jaxslam.io.errors import InputError
-from jaxslam.pipeline import self_calibration
+from jaxslam.pipeline import log_input, self_calibration
 from jaxslam.pipeline.log_input import LogInput
-from jaxslam.smoothing.odometry_calibration import NAMES, default_prior_std, flat, unflat
+from jaxslam.smoothing.odometry_calibration import (
+    NAMES,
+    CalibrationEstimate,
+    default_prior_std,
+    flat,
+    unflat,
+)
+from jaxslam.tuning import calibration_model
 
 CHANGED_SINCE = 0.1
 """Standard deviation, of that of a robot never calibrated, by which a calibration may have changed
@@ -56,7 +63,7 @@ def check_calibration(
     if file is not None and known is not None:
         calibration_file.check_robot(file, known, log)
     with name_errors(str(path)):
-        self_calibration.require_wheels(log, given)
+        self_calibration.require_wheels(log, given.odometry_source)
 
 
 def calibrated(
@@ -82,7 +89,8 @@ def calibrated(
     moved: list[tuple[RecordedDrive, LogInput]] = []
     numbers: list[Metrics] = []
     for number, (drive, given, known) in enumerate(zip(drives, inputs, robots, strict=True), 1):
-        robot, about = known, {}
+        robot = known
+        about: Metrics = {}
         if calibrate:
             robot, about = find_calibration(drive.path, drive.log, given, known)
             suffix = f".{number}" if len(drives) > 1 else ""
@@ -120,21 +128,78 @@ def find_calibration(
     print(f"{path}: calibrating its wheels by its scans ...", flush=True)
     with name_errors(str(path)):
         found = self_calibration.calibrate_log(log, given, mean, prior_std, mount=mount)
-    one = found.estimate
-    robot = RobotCalibration(
-        one.calibration,
-        one.standard_errors,
-        one.not_determined,
+    robot = _robot_of(log, found.estimate, found.mount)
+    num_spans = found.estimate.num_spans
+    counts = f"{num_spans} spans, scans matched {found.num_rounds} times"
+    print_calibration(robot, f"calibration of {path}, by {counts}:")
+    return robot, {"spans": num_spans, "rounds": found.num_rounds}
+
+
+def tune_calibration(
+    paths: Sequence[Path], logs: Sequence[LaserLog], num_train: int
+) -> tuple[RobotCalibration, list[LaserLog]]:
+    """The calibration of one robot by several logs together, and all logs with it; prints it.
+
+    Args:
+        paths: The logs.
+        logs: What they hold.
+        num_train: How many of them, the first ones, it is found from.
+    """
+    found, mount = [], None
+    inputs = [log_input.from_laser_log(log) for log in logs]
+    for path, log, given in list(zip(paths, logs, inputs, strict=True))[:num_train]:
+        print(f"{path}: calibrating its wheels by its scans ...", flush=True)
+        with name_errors(str(path)):
+            found.append(self_calibration.calibrate_log(log, given, mount=mount))
+        mount = found[0].mount
+    first = max(found, key=lambda one: one.estimate.num_spans)
+    with name_errors(str(paths[0])):
+        tuned = calibration_model.tune_calibration([x.spans for x in found], first.estimate)
+    robot = _robot_of(logs[0], tuned, first.mount)
+    print_calibration(robot, f"calibration of the robot, by {tuned.num_spans} spans:")
+    moved = []
+    for path, log, given in zip(paths, logs, inputs, strict=True):
+        own, calibrated_input = use_calibration(path, log, given, robot)
+        moved.append(own._replace(odometry_guessed=calibrated_input.guessed))
+    return robot, moved
+
+
+def check_same_robot(paths: Sequence[Path], logs: Sequence[LaserLog]) -> None:
+    """Raise InputError unless all logs have wheels, and may be of one robot."""
+    for path, log in zip(paths, logs, strict=True):
+        with name_errors(str(path)):
+            self_calibration.require_wheels(log)
+    first = RobotCalibration(
+        Calibration.identity(),
+        Calibration.identity(),
+        (),
+        logs[0].mount,
+        logs[0].mount,
+        logs[0].frames,
+        logs[0].lidar,
+    )
+    for log in logs[1:]:
+        calibration_file.check_robot(paths[0], first, log)
+
+
+def _robot_of(log: LaserLog, found: CalibrationEstimate, wheels: np.ndarray) -> RobotCalibration:
+    """A calibration with the robot of a log."""
+    return RobotCalibration(
+        found.calibration,
+        found.standard_errors,
+        found.not_determined,
         np.asarray(log.mount, float),
-        found.mount,
+        wheels,
         log.frames,
         log.lidar,
     )
-    counts = f"{one.num_spans} spans, scans matched {found.num_rounds} times"
-    print(f"calibration of {path}, by {counts}:")
+
+
+def print_calibration(robot: RobotCalibration, title: str) -> None:
+    """Print the numbers of a calibration."""
+    print(title)
     for line in calibration_lines(robot):
         print(f"  {line}")
-    return robot, {"spans": one.num_spans, "rounds": found.num_rounds}
 
 
 def use_calibration(

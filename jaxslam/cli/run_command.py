@@ -142,7 +142,8 @@ def run(
     earlier, annotated = (None, None) if saved_map is None else _read_map(saved_map)
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
     robots = calibrated_logs.read_calibrations(calibration, log)
-    inputs, drives = [], []
+    inputs: list[LogInput] = []
+    drives: list[RecordedDrive] = []
     for path, laser_log, known, file in zip(log, logs, references, verified, strict=True):
         with name_errors(str(path)):
             inputs.append(log_input.from_laser_log(laser_log, odometry))

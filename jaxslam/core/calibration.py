@@ -149,19 +149,22 @@ def _shift(odometry: Any, times: Any, offset: Any) -> Any:
     apart = end > begin
     fraction = xp.where(apart, (wanted - begin) / xp.where(apart, end - begin, 1.0), 0.0)
     fraction = xp.clip(fraction, 0.0, 1.0)
-    poses = _reckon(odometry)
+    poses = reckon(odometry)
     inside = _part(odometry[after], fraction.astype(odometry.dtype))
     shifted = _compose(poses[after - 1], inside)
     moved = _relative(shifted[:-1], shifted[1:])
     return xp.concat([xp.zeros((1, 3), dtype=odometry.dtype), moved])
 
 
-def _reckon(increments: Any) -> Any:
-    """`se2.dead_reckoning` (T, 3) from the origin in either namespace, headings not wrapped.
+def reckon(increments: Any) -> Any:
+    """`se2.dead_reckoning` (T, 3) from the origin in either namespace; in NumPy by sums, for speed.
 
-    By sums, and not step by step: derivatives through long logs cost no more than the poses.
+    Args:
+        increments: (T, 3) [m, m, rad].
     """
     xp = increments.__array_namespace__()
+    if xp is not np:  # sums of T numbers take long to compile
+        return se2.dead_reckoning(xp.zeros_like(increments[0]), increments)
     heading = xp.cumsum(increments[:, 2])
     moved = _rotate(increments[:, :2], heading - increments[:, 2])
     return xp.concat([xp.cumsum(moved, axis=0), heading[:, None]], axis=1)

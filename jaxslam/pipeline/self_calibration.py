@@ -26,7 +26,7 @@ from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.se2_np import compose, dead_reckoning, relative
 from jaxslam.core.types import AnyArray
 from jaxslam.pipeline import breaks, keyframes, odometry_notes, online
-from jaxslam.pipeline.log_input import LogInput
+from jaxslam.pipeline.log_input import LogInput, OdometrySource
 from jaxslam.smoothing.odometry_calibration import (
     CalibrationEstimate,
     MotionSpans,
@@ -62,11 +62,13 @@ class LogCalibration(NamedTuple):
         estimate: The calibration, and how sure it is.
         mount: (3,) [m, m, rad] where the scanner was taken to be, in the frame between the wheels.
         num_rounds: How often all scans were matched.
+        spans: Of the drive, as they were matched last.
     """
 
     estimate: CalibrationEstimate
     mount: np.ndarray
     num_rounds: int
+    spans: MotionSpans
 
 
 def calibrate_log(
@@ -90,7 +92,7 @@ def calibrate_log(
     Raises:
         ValueError: The log has no odometry, or it is not used.
     """
-    require_wheels(log, given)
+    require_wheels(log, given.odometry_source)
     calibration = Calibration.identity() if mean is None else mean
     odometry, is_share, _ = _shared(given)
     guessed = _guessed(given) | is_share
@@ -107,7 +109,7 @@ def calibrate_log(
         calibration = estimate.calibration
         change, before = np.abs(flat(calibration) - before), flat(calibration)
         limit = CONVERGED * flat(estimate.standard_errors)
-    return LogCalibration(estimate, taken, num_rounds)
+    return LogCalibration(estimate, taken, num_rounds, spans)
 
 
 def calibrated(
@@ -124,7 +126,7 @@ def calibrated(
     Raises:
         ValueError: The log has no odometry, or it is not used.
     """
-    require_wheels(log, given)
+    require_wheels(log, given.odometry_source)
     odometry, is_share, notes = _shared(given)
     moved = calibrate_odometry(
         calibration, odometry, times=usable_times(log.times), mount=np.asarray(mount)
@@ -137,15 +139,19 @@ def calibrated(
     )
 
 
-def require_wheels(log: LaserLog, given: LogInput) -> None:
+def require_wheels(log: LaserLog, source: OdometrySource = "scan") -> None:
     """Raise unless there are wheels to calibrate.
+
+    Args:
+        log: The log.
+        source: Where the motion between scans comes from.
 
     Raises:
         ValueError: The log has no odometry, or it is not used.
     """
     if not log.has_odometry:
         raise ValueError("there is no odometry to calibrate: the log has none that can be used")
-    if given.odometry_source == "scans-only":
+    if source == "scans-only":
         raise ValueError("there is no odometry to calibrate where scans alone are matched")
 
 

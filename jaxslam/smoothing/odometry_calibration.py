@@ -29,7 +29,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 
 from jaxslam.core import se2, se2_np
-from jaxslam.core.calibration import Calibration, calibrate_odometry
+from jaxslam.core.calibration import Calibration, calibrate_odometry, reckon
 from jaxslam.matching.odometry_fusion import DEGREES_OF_FREEDOM
 
 NOISE_LOG_STD = 1.0
@@ -152,15 +152,8 @@ def wheel_motion(calibration: Calibration, spans: MotionSpans) -> Any:
     In the namespace of `spans.odometry`, NumPy or JAX.
     """
     moved = calibrate_odometry(calibration, spans.odometry, times=spans.times, mount=spans.mount)
-    xp = moved.__array_namespace__()
-    heading = xp.cumsum(moved[:, 2])  # not wrapped; sums, and not step by step: see `calibration`
-    before = heading - moved[:, 2]
-    cos, sin = xp.cos(before), xp.sin(before)
-    x = xp.cumsum(cos * moved[:, 0] - sin * moved[:, 1])
-    y = xp.cumsum(sin * moved[:, 0] + cos * moved[:, 1])
-    start, end = (
-        xp.stack([x[at], y[at], heading[at]], axis=-1) for at in (spans.first, spans.last)
-    )
+    xp, poses = moved.__array_namespace__(), reckon(moved)
+    start, end = poses[spans.first], poses[spans.last]
     gap = end - start
     cos, sin = xp.cos(start[:, 2]), xp.sin(start[:, 2])
     ahead, left = cos * gap[:, 0] + sin * gap[:, 1], cos * gap[:, 1] - sin * gap[:, 0]

@@ -95,7 +95,8 @@ def _recover(seed: int, number: int, train: Episode, test: Episode) -> common.Nu
 
 
 def _errors(params: NoiseParams, train: Episode) -> common.Numbers:
-    return standard_errors.standard_errors(exact_model.CONFIG, params, train)._asdict()
+    found = standard_errors.standard_errors(exact_model.CONFIG, params, train)._asdict()
+    return {key: value for key, value in found.items() if key != "of_params"}
 
 
 def position_rmse(params: NoiseParams, drives: Episode) -> float:

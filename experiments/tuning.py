@@ -67,7 +67,7 @@ def recorded(folder: Path) -> noise_search.Task:
         NoiseParams.for_landmark_sensor(),
         episodes.stack_episodes(drives[: len(TRAIN)]),
         episodes.stack_episodes(drives[len(TRAIN) :]),
-        frozen=("wall",),  # there are no walls
+        frozen=("wall_angle_std",),  # there are no walls
     )
 
 

@@ -112,9 +112,7 @@ def calibrate_odometry(
     return xp.where(xp.arange(len(moved))[:, None] > 0, moved, xp.zeros_like(moved))
 
 
-def scale_increments(
-    calibration: Calibration, odometry: Any, *, wheel_base: float = 0.0
-) -> Any:
+def scale_increments(calibration: Calibration, odometry: Any, *, wheel_base: float = 0.0) -> Any:
     """Increments (..., 3) of the robot, of which the wheels report `odometry` (..., 3).
 
     With d the length of an increment's arc, and t its turn,

@@ -1,4 +1,4 @@
-"""Noise parameters (Q and R) tuned by gradient; see README.md here.
+"""Parameters of a model tuned by gradient, Q and R of the filter above all; see README.md here.
 
 The function `standard_errors` is in the module of the same name.
 """
@@ -12,9 +12,19 @@ from jaxslam.tuning.losses import WeightedLoss as WeightedLoss
 from jaxslam.tuning.losses import innovation_nll as innovation_nll
 from jaxslam.tuning.losses import pose_mse as pose_mse
 from jaxslam.tuning.losses import pose_nll as pose_nll
+from jaxslam.tuning.model import Model as Model
+from jaxslam.tuning.model import run_model as run_model
 from jaxslam.tuning.optimizers import default_optimizer as default_optimizer
 from jaxslam.tuning.optimizers import lbfgs_backtracking as lbfgs_backtracking
 from jaxslam.tuning.parameters import param_names as param_names
+from jaxslam.tuning.priors import Prior as Prior
+from jaxslam.tuning.slam_model import slam_model as slam_model
 from jaxslam.tuning.standard_errors import StandardErrors as StandardErrors
+from jaxslam.tuning.transforms import CHOLESKY as CHOLESKY
+from jaxslam.tuning.transforms import POSITIVE as POSITIVE
+from jaxslam.tuning.transforms import REAL as REAL
+from jaxslam.tuning.transforms import Transform as Transform
+from jaxslam.tuning.transforms import bounded as bounded
+from jaxslam.tuning.transforms import real as real
 from jaxslam.tuning.tune_state import TuneResult as TuneResult
 from jaxslam.tuning.tune_state import TuneState as TuneState

@@ -1,15 +1,19 @@
-"""Tune Q and R by gradient descent on a loss of the filter.
+"""Tune the parameters of a model by gradient descent on a loss.
 
-Features are extracted once; each evaluation runs the filter on them and differentiates it. All
-fields of `NoiseParams` are smooth and tuned, as logarithms. Data association is not smooth: it is
-found anew at every evaluation, and the gradient is that of the filter with its matches held fixed.
-Parameters that act on the matches alone, above all the probability of the association gate
-(`AssociationSpec.gate`), have no gradient, and are not tuned here.
+A model is any state-space model (`model.Model`), its parameters any tree of numbers; the SLAM
+filter with its Q and R is one (`slam_model`), and a `Config` stands for it. Each evaluation runs
+the model over the sequences and differentiates it by the unconstrained numbers that make its
+parameters (`transforms`).
+
+Data association of the SLAM filter is not smooth: it is found anew at every evaluation, and the
+gradient is that of the filter with its matches held fixed. Parameters that act on the matches
+alone, above all the probability of the association gate (`AssociationSpec.gate`), have no gradient,
+and are not tuned here.
 """
 
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,67 +22,139 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxslam.core.devices import DeviceMap
-from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.types import Array, as_count
-from jaxslam.filtering import config as config_module
-from jaxslam.filtering import slam_filter
-from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
-from jaxslam.tuning.inputs import as_params, check_alike, prepare
-from jaxslam.tuning.losses import Loss, pose_nll
+from jaxslam.tuning import parameters
+from jaxslam.tuning.inputs import check_alike
+from jaxslam.tuning.losses import Loss, check_loss, default_loss, model_for, resolve
+from jaxslam.tuning.model import Model, num_steps, run_model
 from jaxslam.tuning.optimizers import default_optimizer
 from jaxslam.tuning.parameters import constrain, trainable_mask, unconstrain, unflatten_params
+from jaxslam.tuning.priors import FlatPrior, flatten_prior
+from jaxslam.tuning.slam_model import SlamCheck, as_model
+from jaxslam.tuning.transforms import Transform, of_leaves
 from jaxslam.tuning.tune_state import TuneResult as TuneResult
 from jaxslam.tuning.tune_state import TuneState as TuneState
 from jaxslam.tuning.tune_state import check_state, record, stalled
 from jaxslam.tuning.tune_state import init as init
 from jaxslam.tuning.tune_state import result as result
 
-EPISODE_BATCH = 4  # episodes that a device differentiates together; bounds memory
+SEQUENCE_BATCH = 4  # sequences that a device differentiates together; bounds memory
+
+Transforms = tuple[Transform, ...]
 
 
-def _value(config: Config, loss: Loss, theta: NoiseParams, episode: Episode) -> Array:
-    """Loss () of one episode."""
-    start = config_module.init(config.filter, episode.truth[0])
-    measurements = measurements_of(episode)
-    _, info = slam_filter.run_filter(config.filter, constrain(theta), start, measurements)
-    return loss(info, episode)
+class Problem(NamedTuple):
+    """What is tuned, checked.
+
+    Attributes:
+        model: The model.
+        loss: The loss.
+        transforms: Of each leaf of the parameters.
+        params: The parameters as arrays.
+        data: [B] sequences as arrays.
+    """
+
+    model: Model
+    loss: Loss
+    transforms: Transforms
+    params: Any
+    data: Any
+
+
+def prepare(
+    model: Model | Config,
+    params: Any,
+    data: Any,
+    loss: Loss | str | None = None,
+    *,
+    transforms: Any = None,
+    name: str | None = None,
+) -> Problem:
+    """The arguments of `tune`, checked and converted; ValueError unless all fits together.
+
+    Args:
+        model: The model.
+        params: Its parameters.
+        data: [B] sequences.
+        loss: The loss; None for the default one.
+        transforms: Of the parameters.
+        name: What the data are called in messages; by default episodes, where they are such.
+    """
+    model = as_model(model)
+    if name is None:
+        name = "episodes" if isinstance(model.check, SlamCheck) else "data"
+    params, stacked = model.check(params, data, name)
+    used = of_leaves(params, transforms)
+    arrays = parameters.as_params(params, transforms)
+    function = default_loss(stacked) if loss is None else resolve(loss)
+    check_loss(function, stacked, name=name, model=model)
+    return Problem(model_for(function, model), function, used, arrays, stacked)
+
+
+def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any) -> Array:
+    """Loss () of one sequence."""
+    _, info = run_model(model, constrain(theta, transforms), sequence)
+    return loss(info, sequence)
 
 
 def _value_and_gradient(
-    config: Config, loss: Loss, theta: NoiseParams, episode: Episode
+    model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any
 ) -> tuple[Array, Array]:
-    """Loss () of one episode and its gradient (P,) in the logarithms of the noise."""
-    value, gradient = jax.value_and_grad(_value, argnums=2)(config, loss, theta, episode)
+    """Loss () of one sequence and its gradient (P,) in the unconstrained numbers."""
+    differentiated = jax.value_and_grad(_value, argnums=3)
+    value, gradient = differentiated(model, loss, transforms, theta, sequence)
     return value, ravel_pytree(gradient)[0]
 
 
-_VALUES = DeviceMap(_value, size=EPISODE_BATCH, static=2)
-_GRADIENTS = DeviceMap(_value_and_gradient, size=EPISODE_BATCH, static=2)
+_VALUES = DeviceMap(_value, size=SEQUENCE_BATCH, static=3)
+_GRADIENTS = DeviceMap(_value_and_gradient, size=SEQUENCE_BATCH, static=3)
 
 
 def values(
-    config: Config, params: NoiseParams, episodes: Episode, loss: Loss | str = pose_nll
+    model: Model | Config,
+    params: Any,
+    data: Any,
+    loss: Loss | str | None = None,
+    *,
+    transforms: Any = None,
 ) -> np.ndarray:
-    """Loss (B,) float64 of each episode [B].
+    """Loss (B,) float64 of each sequence of data [B].
 
     Raises:
         ValueError: As `tune`.
     """
-    params, stacked, function = prepare(config, params, episodes, loss)
-    return np.asarray(_VALUES(config, function, unconstrain(params), stacked), np.float64)
+    return values_of(prepare(model, params, data, loss, transforms=transforms))
+
+
+def values_of(problem: Problem) -> np.ndarray:
+    """`values` of a problem that is checked."""
+    model, loss, transforms, params, data = problem
+    theta = unconstrain(params, transforms)
+    return np.asarray(_VALUES(model, loss, transforms, theta, data), np.float64)
 
 
 def gradients(
-    config: Config, params: NoiseParams, episodes: Episode, loss: Loss | str = pose_nll
+    model: Model | Config,
+    params: Any,
+    data: Any,
+    loss: Loss | str | None = None,
+    *,
+    transforms: Any = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Loss (B,) of each episode and its gradient (B, P) in the logarithms of the noise, float64.
+    """Loss (B,) of each sequence and its gradient (B, P) in the unconstrained numbers, float64.
 
     Raises:
         ValueError: As `tune`.
     """
-    params, stacked, function = prepare(config, params, episodes, loss)
-    value, gradient = _GRADIENTS(config, function, unconstrain(params), stacked)
+    return gradients_of(prepare(model, params, data, loss, transforms=transforms))
+
+
+def gradients_of(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """`gradients` of a problem that is checked."""
+    model, loss, transforms, params, data = problem
+    theta = unconstrain(params, transforms)
+    value, gradient = _GRADIENTS(model, loss, transforms, theta, data)
     return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
 
 
@@ -108,27 +184,29 @@ def draw_batch(seed: int, step: int, num_episodes: int, batch_size: int) -> np.n
 
 
 def tune(
-    config: Config,
-    params: NoiseParams,
-    episodes: Episode | list[Episode],
+    model: Model | Config,
+    params: Any,
+    data: Any,
     *,
-    loss: Loss | str = pose_nll,
+    loss: Loss | str | None = None,
+    transforms: Any = None,
+    prior: Any = None,
     optimizer: optax.GradientTransformation | None = None,
     num_updates: int = 30,
     batch_size: int | None = None,
     seed: int = 0,
     frozen: Collection[str] = (),
-    heldout: Episode | list[Episode] | None = None,
+    heldout: Any = None,
     evaluate_every: int = 1,
     patience: int | None = None,
     state: TuneState | None = None,
     callback: Callable[[TuneState], Any] | None = None,
 ) -> TuneResult:
-    """Tune the noise on episodes by gradient descent.
+    """Tune the parameters of a model on data by gradient descent.
 
         for step in 0 .. num_updates:
-            loss, gradient = mean over the episodes of this step (all, or a minibatch)
-            if it is due: heldout = mean loss over the held-out episodes
+            loss, gradient = mean over the sequences of this step (all, or a minibatch), and prior
+            if it is due: heldout = mean loss over the held-out sequences
             record them
             theta <- theta + update of the optimiser, free parameters only
             call `callback` with the state
@@ -137,18 +215,24 @@ def tune(
     The update after the last evaluation is part of the state but not of the result.
 
     Args:
-        config: Its filter is the one that is tuned.
-        params: Where to start.
-        episodes: [B] training episodes, or a list of single ones.
-        loss: Its mean over episodes is minimised; one of `losses`, also by its name, or any
-            function of the step infos of the filter on an episode, and the episode.
-        optimizer: Of the logarithms of the free parameters; `optimizers.default_optimizer` by
-            default.
+        model: The model; a `Config` stands for the SLAM filter that it configures.
+        params: Where to start: any tree of numbers; of the SLAM filter `NoiseParams`.
+        data: [B] training sequences in any tree; of the SLAM filter episodes, or a list of them.
+        loss: Its mean over sequences is minimised; one of `losses`, also by its name, or any
+            function of what the steps of the model returned on a sequence, and the sequence.
+            By default `pose_nll` where there are true poses, else `innovation_nll`.
+        transforms: Of the parameters, in a tree like theirs, each for all below it; by default
+            `transforms.default_transforms`.
+        prior: `priors.Prior`s in a tree like the parameters, None where there is none. Their
+            negative log density is divided by B and the number of steps T and added to the loss,
+            as the losses here are means over steps.
+        optimizer: Of the unconstrained numbers of the free parameters;
+            `optimizers.default_optimizer` by default.
         num_updates: Number of updates.
-        batch_size: Episodes of a minibatch; all of them by default.
+        batch_size: Sequences of a minibatch; all of them by default.
         seed: Of the order of minibatches.
-        frozen: Names of parameters, or fields of the noise, that are not tuned.
-        heldout: [H] episodes for validation, which nothing is tuned on.
+        frozen: Names of parameters, or of what they are part of, that are not tuned.
+        heldout: [H] sequences for validation, which nothing is tuned on.
         evaluate_every: Evaluations from one validation to the next.
         patience: Validations without improvement after which it stops; by default it does not.
         state: State of an earlier call with the same arguments, to continue from; the result is
@@ -156,49 +240,70 @@ def tune(
         callback: Called with the state after each evaluation.
 
     Returns:
-        The result. Its noise is the best: on the held-out episodes if there are any, else on all
-        training episodes; with minibatches and no held-out episodes, whose losses are not
+        The result. Its parameters are the best: on the held-out sequences if there are any, else
+        on all training sequences; with minibatches and no held-out sequences, whose losses are not
         comparable, the last.
 
     Raises:
-        ValueError: Before anything is compiled: an argument has another type; a field of the noise
-            or of an episode another shape or kind; the noise is not finite and positive; there are
-            no episodes; the loss needs ground truth and an episode has none; scan matches are
-            given, and no `scan_match_std_scale`; held-out episodes have other fields; a
-            parameter's name is unknown; a number is out of range; the state is of another call.
+        ValueError: Before anything is compiled: an argument has another type; a parameter is
+            outside the domain of its transform; the data do not fit the model; a step of the model
+            returns another state than it is given; there are no data; the loss needs ground truth
+            and an episode has none; held-out episodes have other fields; a parameter's name is
+            unknown; a number is out of range; the state is of another call.
     """
-    params, training, function = prepare(config, params, episodes, loss)
-    params = as_params(params)
+    problem = prepare(model, params, data, loss, transforms=transforms)
+    model, used_loss, used, params, training = problem
     validation = None
     if heldout is not None:
-        validation = prepare(config, params, heldout, loss, name="heldout")[1]
+        checked = prepare(model, params, heldout, used_loss, transforms=transforms, name="heldout")
+        validation = checked.data
         check_alike(training, validation)
     num_updates = as_count("num_updates", num_updates, least=0)
     seed = as_count("seed", seed, least=0)
     as_count("evaluate_every", evaluate_every)
     as_count("patience", 1 if patience is None else patience)
-    trainable, count = trainable_mask(params, frozen), training.odometry.shape[0]
+    trainable = trainable_mask(params, frozen, transforms)
+    count = len(jax.tree.leaves(training)[0])
     size = count if batch_size is None else min(count, as_count("batch_size", batch_size))
     whole = size == count
+    penalty = flatten_prior(prior, params, transforms)
+    weight = 1.0 / (count * num_steps(model, params, training))
     if optimizer is None:
         optimizer = default_optimizer(num_updates, whole=whole)
     optimizer = optax.with_extra_args_support(optimizer)
     if state is None:
-        state = init(params, num_updates=num_updates, frozen=frozen, optimizer=optimizer)
+        state = init(
+            params,
+            num_updates=num_updates,
+            frozen=frozen,
+            optimizer=optimizer,
+            transforms=transforms,
+        )
     check_state(state, trainable.size, num_updates)
 
     while state.step <= num_updates and not stalled(state, patience):
-        current, step = unflatten_params(state.theta, params), int(state.step)
+        current = unflatten_params(state.theta, params, transforms)
+        step = int(state.step)
         batch = training if whole else _take(draw_batch(seed, step, count, size), training)
-        value, gradient, skipped = mean_gradient(*gradients(config, current, batch, function))
+        now = problem._replace(params=current, data=batch)
+        value, gradient, skipped = mean_gradient(*gradients_of(now))
+        value, gradient = _with_prior(value, gradient, penalty, weight, state.theta)
         heldout_loss = np.nan
         if validation is not None and (step % evaluate_every == 0 or step == num_updates):
-            heldout_loss = _finite_mean(values(config, current, validation, function))
+            heldout_loss = _finite_mean(values_of(now._replace(data=validation)))
         state = record(state, value, heldout_loss, skipped)
         state = _update_theta(state, optimizer, value, gradient, trainable)
         if callback is not None:
             callback(state)
-    return result(state, params, whole=whole)
+    return result(state, params, whole=whole, transforms=transforms)
+
+
+def _with_prior(
+    value: float, gradient: np.ndarray, prior: FlatPrior, weight: float, theta: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Loss and gradient (P,) with the prior's, which counts as `weight` of it."""
+    own, slope = prior.value_and_gradient(theta)
+    return value + weight * own, gradient + weight * slope
 
 
 def _update_theta(
@@ -222,9 +327,9 @@ def _optimizer_update(
     return optimizer.update(gradient, state, theta, value=value)
 
 
-def _take(indices: np.ndarray, episodes: Episode) -> Episode:
-    """Some of the episodes, by number."""
-    return jax.tree.map(lambda x: x[indices], episodes)
+def _take(indices: np.ndarray, data: Any) -> Any:
+    """Some of the sequences, by number."""
+    return jax.tree.map(lambda x: x[indices], data)
 
 
 def _finite_mean(values: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Checks of what this package is given: configuration, noise, episodes. Nothing is compiled yet."""
+"""Checks of the data of the SLAM filter: noise and episodes. Nothing is compiled yet."""
 
 from typing import Any
 
@@ -12,9 +12,7 @@ from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.types import check_array, check_type
 from jaxslam.filtering.inputs import FLOATS, OTHERS, check_params, concrete_values
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.stacking import stack_list
-from jaxslam.tuning.losses import Loss, check_loss, resolve
 
 SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
     "increment": (3,),
@@ -27,33 +25,6 @@ SCAN_MATCH_FIELDS: dict[str, tuple[int, ...]] = {
 """Sizes after B and T of each field of `ScanMatch`; all are floats, the last three perhaps None."""
 
 ORDER = "; the order is config, params, episodes"  # two that were swapped are the usual cause
-
-
-def prepare(
-    config: Config,
-    params: NoiseParams,
-    episodes: Episode | list[Episode],
-    loss: Loss | str,
-    *,
-    name: str = "episodes",
-) -> tuple[NoiseParams, Episode, Loss]:
-    """Noise and episodes as arrays, and the loss; ValueError unless all fits together.
-
-    The values of the noise are not looked at: an optimiser may propose some that overflow, whose
-    loss is not finite.
-    """
-    check_type("config", config, Config, advice=ORDER)
-    params, stacked = as_params(params, positive=False), as_episodes(episodes, name=name)
-    function = resolve(loss)
-    check_loss(function, stacked, name=name)
-    check_scan_matching(params, stacked, name=name)
-    capacity, ids = config.filter.max_landmarks, stacked.landmark_ids
-    if ids is not None and np.max(ids, initial=-1) >= capacity:
-        raise ValueError(
-            f"{name}.landmark_ids holds {np.max(ids)}, but config.filter.max_landmarks is "
-            f"{capacity}: ids are 0 to max_landmarks - 1"
-        )
-    return params, stacked, function
 
 
 def as_params(params: NoiseParams, *, positive: bool = True) -> NoiseParams:
@@ -164,17 +135,23 @@ def check_scan_matching(params: NoiseParams, episodes: Episode, *, name: str = "
         )
 
 
-def check_alike(episodes: Episode, heldout: Episode) -> None:
-    """Raise ValueError unless held-out episodes are of the kind of those to tune on.
+def check_alike(data: Any, heldout: Any) -> None:
+    """Raise ValueError unless held-out sequences are of the kind of those to tune on.
 
-    They have the same fields and the same number M of features a step; B and T may differ.
+    They have the same fields, and episodes the same number M of features a step; B and T may
+    differ.
     """
+    if not (isinstance(data, Episode) and isinstance(heldout, Episode)):
+        wanted, found = str(jax.tree.structure(data)), str(jax.tree.structure(heldout))
+        if found != wanted:
+            raise ValueError(f"heldout is {found}, not {wanted} as the data to tune on")
+        return
     for field in ("landmark_ids", "scan_matches"):
-        ours, other = (getattr(part, field) is None for part in (episodes, heldout))
+        ours, other = (getattr(part, field) is None for part in (data, heldout))
         if ours != other:
             without, given = ("episodes", "heldout") if ours else ("heldout", "episodes")
             raise ValueError(f"{without}.{field} is None, but {given}.{field} is not")
-    m, other_m = (part.features.kind.shape[2] for part in (episodes, heldout))
+    m, other_m = (part.features.kind.shape[2] for part in (data, heldout))
     if m != other_m:
         raise ValueError(
             f"heldout has M = {other_m} features a step, episodes has {m}; pad them alike, as "

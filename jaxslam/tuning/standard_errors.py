@@ -1,6 +1,6 @@
-"""Standard errors of tuned noise parameters, from the curvature of the loss.
+"""Standard errors of tuned parameters, from the curvature of the loss.
 
-Sandwich estimator. The parameters theta, logarithms of the noise, minimise the mean loss of B
+Sandwich estimator. The unconstrained numbers theta of the parameters minimise the mean loss of B
 independent episodes, (1/B) sum_b l_b(theta). With g_b the gradient of l_b at the true minimum
 theta_0, H the mean of the Hessians of l_b, and the mean gradient zero at the estimate theta,
 
@@ -18,20 +18,28 @@ J = H, and C = H^-1 / B, the inverse Fisher information.
 
 Along an eigenvector v of H, with eigenvalue c, the variance is v^T C v = (v^T J v / B) / c^2. The
 data determine the direction if c > 0 and this is below 1: a standard error of theta below 1, a
-factor of e in the noise. H is inverted on the determined directions only.
+factor of e in a standard deviation. H is inverted on the determined directions only.
+
+A prior with precision P, a diagonal matrix, counts as w = 1 / (B T) of the loss, with T steps:
+
+    C = A^-1 (J / B + w^2 P) A^-1,    A = H + w P
+
+which is P^-1 where the data say nothing, and as above where they say all. Which parameters the data
+determine is answered without it.
 """
 
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from jaxslam.core.episode import Episode
-from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
 from jaxslam.tuning import fitting, parameters
-from jaxslam.tuning.inputs import as_params, prepare
-from jaxslam.tuning.losses import Loss, pose_nll
+from jaxslam.tuning.fitting import Problem
+from jaxslam.tuning.losses import Loss
+from jaxslam.tuning.model import Model, num_steps
+from jaxslam.tuning.priors import flatten_prior
 
 DIFFERENCE_STEP = 0.1  # step of a logarithm for central differences of the gradient
 # Relative standard error from which a parameter counts as not identifiable.
@@ -41,14 +49,16 @@ MAX_UNKNOWN_SHARE = 0.1
 
 
 class StandardErrors(NamedTuple):
-    """Standard errors of the logarithms of P parameters: 0.1 is ten percent.
+    """Standard errors of the unconstrained numbers theta of P parameters.
 
     Attributes:
         names: (P,) names of the parameters.
-        relative: (P,) standard errors; NaN where frozen, inf where not determined.
-        covariance: (P, P) in the determined directions; zero where frozen.
+        relative: (P,) standard errors of theta: of the logarithm of a positive parameter, so 0.1 is
+            ten percent; NaN where frozen, inf where not determined.
+        covariance: (P, P) of theta in the determined directions; zero where frozen.
         identifiable: (P,) bool; False where frozen.
         warnings: Messages about free parameters that are not identifiable; empty if all are.
+        of_params: Standard errors of the parameters themselves, in their units and their tree.
     """
 
     names: tuple[str, ...]
@@ -56,76 +66,82 @@ class StandardErrors(NamedTuple):
     covariance: np.ndarray
     identifiable: np.ndarray
     warnings: tuple[str, ...]
+    of_params: Any = None
 
 
 def standard_errors(
-    config: Config,
-    params: NoiseParams,
-    episodes: Episode | list[Episode],
+    model: Model | Config,
+    params: Any,
+    data: Any,
     *,
-    loss: Loss | str = pose_nll,
+    loss: Loss | str | None = None,
+    transforms: Any = None,
+    prior: Any = None,
     frozen: Collection[str] = (),
 ) -> StandardErrors:
     """Standard errors of tuned parameters by the sandwich estimator, C = H^-1 J H^-1 / B.
 
-    The module's docstring derives it. The model need not be correct. B is the number of episodes
+    The module's docstring derives it. The model need not be correct. B is the number of sequences
     whose loss and gradient are finite, over which H and J are means, too; fewer than two of these
     determine nothing.
 
     Args:
-        config: Its filter is the one that was tuned.
-        params: Minimum of the mean loss over the episodes, as `fitting.tune` found it.
-        episodes: [B] episodes that it was tuned on, or a list of single ones.
+        model: The model that was tuned; a `Config` stands for its SLAM filter.
+        params: Minimum of the mean loss over the sequences, as `fitting.tune` found it.
+        data: [B] sequences that it was tuned on, or a list of single episodes.
         loss: The loss that it was tuned by.
-        frozen: Names of parameters, or fields of the noise, that were not tuned.
+        transforms: Of the parameters, as of `fitting.tune`.
+        prior: Of the parameters, as of `fitting.tune`.
+        frozen: Names of parameters, or of what they are part of, that were not tuned.
 
     Raises:
-        ValueError: Fewer than two episodes, or as `fitting.tune`.
+        ValueError: Fewer than two sequences, or as `fitting.tune`.
 
     References:
         White (1982), "Maximum likelihood estimation of misspecified models".
     """
-    params, stacked, function = prepare(config, params, episodes, loss)
-    params = as_params(params)
-    trainable = parameters.trainable_mask(params, frozen)
-    if len(stacked.odometry) < 2:
+    problem = fitting.prepare(model, params, data, loss, transforms=transforms)
+    params = problem.params
+    trainable = parameters.trainable_mask(params, frozen, transforms)
+    count = len(jax.tree.leaves(problem.data)[0])
+    if count < 2:
         raise ValueError("standard errors need two episodes or more; episodes has 1")
-    hessian, gradients = second_derivatives(config, params, stacked, loss=function, frozen=frozen)
+    theta = parameters.flatten_params(params, transforms)
+    steps = num_steps(problem.model, params, problem.data)
+    precision = flatten_prior(prior, params, transforms).precision[trainable]
+    hessian, gradients = second_derivatives(problem, theta, trainable, transforms)
     used = len(gradients)
     outer = gradients.T @ gradients / max(used, 1)
     if used < 2:
         hessian, outer = np.zeros_like(hessian), np.zeros_like(outer)
-    return _errors(parameters.param_names(params), trainable, hessian, outer, used)
+    own, unknown = _covariance(hessian, outer, used, precision / (count * steps), count * steps)
+    return _errors(params, transforms, theta, trainable, own, unknown, used)
 
 
 def second_derivatives(
-    config: Config,
-    params: NoiseParams,
-    episodes: Episode,
-    *,
-    loss: Loss,
-    frozen: Collection[str] = (),
+    problem: Problem, theta: np.ndarray, trainable: np.ndarray, transforms: Any = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean Hessian over episodes in the F free parameters, by differences of the gradient.
+    """Mean Hessian over sequences in the F free parameters, by differences of the gradient.
 
     Args:
-        config: Its filter is run.
-        params: Where to evaluate it.
-        episodes: [B] episodes.
-        loss: The loss.
-        frozen: Names of parameters, or fields of the noise, that are not free.
+        problem: The model, its loss and the data.
+        theta: (P,) where to evaluate it.
+        trainable: (P,) bool, which are free.
+        transforms: Of the parameters.
 
     Returns:
-        The Hessian (F, F), symmetric, of the logarithms of the parameters; and the gradients
-        (G, F) of the G episodes whose loss and gradient are finite.
+        The Hessian (F, F), symmetric; and the gradients (G, F) of the G sequences whose loss and
+        gradient are finite.
     """
-    indices = np.flatnonzero(parameters.trainable_mask(params, frozen))
-    values, gradients = fitting.gradients(config, params, episodes, loss)
+    indices = np.flatnonzero(trainable)
+    values, gradients = fitting.gradients_of(problem)
     good = np.isfinite(values) & np.isfinite(gradients).all(axis=1)
 
-    def gradient_beside(parameter: int, offset: float) -> np.ndarray:
-        beside = parameters.scale_param(params, parameter, offset)
-        return fitting.mean_gradient(*fitting.gradients(config, beside, episodes, loss))[1][indices]
+    def gradient_beside(index: int, offset: float) -> np.ndarray:
+        beside = theta + offset * (np.arange(len(theta)) == index)
+        params = parameters.unflatten_params(beside, problem.params, transforms)
+        each = fitting.gradients_of(problem._replace(params=params))
+        return fitting.mean_gradient(*each)[1][indices]
 
     rows = [
         (gradient_beside(i, DIFFERENCE_STEP) - gradient_beside(i, -DIFFERENCE_STEP))
@@ -134,6 +150,27 @@ def second_derivatives(
     ]
     hessian = np.stack(rows)
     return (hessian + hessian.T) / 2, gradients[good][:, indices]
+
+
+def _covariance(
+    hessian: np.ndarray, outer: np.ndarray, count: int, precision: np.ndarray, total: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (F, F), and each parameter's squared component (F,) in unknown directions.
+
+    Args:
+        hessian: (F, F) H.
+        outer: (F, F) J.
+        count: B, the sequences that count.
+        precision: (F,) w P of the priors; all zero for none.
+        total: 1 / w.
+    """
+    inverse, unknown = _invert_determined(hessian, outer, count)
+    if precision.any():
+        curvature, direction = np.linalg.eigh(hessian)  # the noise of H makes some negative
+        hessian = direction * np.maximum(curvature, 0.0) @ direction.T + np.diag(precision)
+        outer = outer + max(count, 1) * np.diag(precision) / total
+        inverse = _invert_determined(hessian, outer, count)[0]
+    return inverse @ outer @ inverse / max(count, 1), unknown
 
 
 def _invert_determined(
@@ -159,16 +196,17 @@ def _invert_determined(
 
 
 def _errors(
-    names: tuple[str, ...],
+    params: Any,
+    transforms: Any,
+    theta: np.ndarray,
     trainable: np.ndarray,
-    hessian: np.ndarray,
-    outer: np.ndarray,
+    own: np.ndarray,
+    unknown: np.ndarray,
     count: int,
 ) -> StandardErrors:
-    """Standard errors of P parameters from H and J (F, F) of the F that are trainable (P,) bool."""
-    inverse, undetermined = _invert_determined(hessian, outer, count)
-    own = inverse @ outer @ inverse / max(count, 1)
-    own_relative = np.where(undetermined < MAX_UNKNOWN_SHARE, np.sqrt(np.diag(own)), np.inf)
+    """Standard errors of P parameters, from the covariance (F, F) of those that are trainable."""
+    names = parameters.param_names(params, transforms)
+    own_relative = np.where(unknown < MAX_UNKNOWN_SHARE, np.sqrt(np.diag(own)), np.inf)
 
     size = len(trainable)
     covariance, relative = np.zeros((size, size)), np.full(size, np.nan)
@@ -176,9 +214,30 @@ def _errors(
     relative[trainable] = own_relative
     identifiable = np.zeros(size, bool)
     identifiable[trainable] = own_relative < IDENTIFIABLE_BELOW
+    of_params = _of_params(params, transforms, theta, covariance, relative)
     unidentifiable = [names[i] for i in np.flatnonzero(trainable & ~identifiable)]
-    if not unidentifiable:
-        return StandardErrors(names, relative, covariance, identifiable, ())
-    advice = "freeze some, or take more episodes or another loss"
-    warning = f"not identifiable from these {count} episodes: {', '.join(unidentifiable)}; {advice}"
-    return StandardErrors(names, relative, covariance, identifiable, (warning,))
+    warnings = []
+    if unidentifiable:
+        advice = "freeze some, or take more episodes or another loss"
+        found = ", ".join(unidentifiable)
+        warnings = [f"not identifiable from these {count} episodes: {found}; {advice}"]
+    return StandardErrors(names, relative, covariance, identifiable, tuple(warnings), of_params)
+
+
+def _of_params(
+    params: Any, transforms: Any, theta: np.ndarray, covariance: np.ndarray, relative: np.ndarray
+) -> Any:
+    """Standard errors in the tree of the parameters, to first order.
+
+    NaN where all that a number depends on is frozen, inf where some of it is not determined.
+    """
+    jacobian = parameters.natural_jacobian(theta, params, transforms)
+    depends = jacobian != 0.0
+    with np.errstate(invalid="ignore"):
+        flat = np.sqrt(np.einsum("np,pq,nq->n", jacobian, covariance, jacobian))
+    flat[(depends & np.isinf(relative)).any(axis=1)] = np.inf
+    flat[~(depends & ~np.isnan(relative)).any(axis=1)] = np.nan
+    leaves = jax.tree.leaves(params)
+    parts = np.split(flat, np.cumsum([np.size(x) for x in leaves])[:-1])
+    shaped = [x.reshape(np.shape(y)) for x, y in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(params), shaped)

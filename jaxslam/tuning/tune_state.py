@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.flatten_util import ravel_pytree
 
 from jaxslam.core.types import check_type
-from jaxslam.filtering.noise import NoiseParams
-from jaxslam.tuning.inputs import as_params
-from jaxslam.tuning.parameters import constrain, trainable_mask
+from jaxslam.tuning import parameters
 
 
 class TuneState(NamedTuple):
@@ -20,12 +17,12 @@ class TuneState(NamedTuple):
 
     Attributes:
         step: () int64 number of evaluations so far.
-        theta: (P,) float64 logarithms of the noise to be evaluated next.
+        theta: (P,) float64 unconstrained numbers of the parameters to be evaluated next.
         optimizer_state: State of the optimiser, of the free parameters.
-        theta_history: (N + 1, P) float64 logarithms that each evaluation used; NaN: not yet.
-        loss: (N + 1,) float64 mean over the episodes of each evaluation; NaN: not yet.
-        heldout: (N + 1,) float64 mean over the held-out episodes; NaN: not evaluated.
-        skipped: (N + 1,) int64 episodes left out of the mean because a value was not finite.
+        theta_history: (N + 1, P) float64 those that each evaluation used; NaN: not yet.
+        loss: (N + 1,) float64 mean over the sequences of each evaluation, and prior; NaN: not yet.
+        heldout: (N + 1,) float64 mean over the held-out sequences; NaN: not evaluated.
+        skipped: (N + 1,) int64 sequences left out of the mean because a value was not finite.
     """
 
     step: np.int64
@@ -41,40 +38,42 @@ class TuneResult(NamedTuple):
     """Result of `tune`. N evaluations: one more than updates, or fewer when it stopped early.
 
     Attributes:
-        params: The best noise.
+        params: The best parameters.
         best: Number of the evaluation it is from.
-        loss: (N,) mean over the episodes of each evaluation.
-        heldout: (N,) mean over the held-out episodes; NaN where not evaluated.
-        history: [N] noise that each evaluation used.
-        skipped: (N,) episodes left out of the mean because a value was not finite.
+        loss: (N,) mean over the sequences of each evaluation, and prior.
+        heldout: (N,) mean over the held-out sequences; NaN where not evaluated.
+        history: [N] parameters that each evaluation used.
+        skipped: (N,) sequences left out of the mean because a value was not finite.
     """
 
-    params: NoiseParams
+    params: Any
     best: int
     loss: np.ndarray
     heldout: np.ndarray
-    history: NoiseParams
+    history: Any
     skipped: np.ndarray
 
 
 def init(
-    params: NoiseParams,
+    params: Any,
     *,
     num_updates: int,
     optimizer: optax.GradientTransformation,
     frozen: Collection[str] = (),
+    transforms: Any = None,
 ) -> TuneState:
     """The state before the first evaluation; the arguments are those of `tune`.
 
     Raises:
-        ValueError: The noise is not positive, or a parameter's name is unknown.
+        ValueError: A parameter is outside the domain of its transform, or a name is unknown.
     """
-    start = np.asarray(ravel_pytree(as_params(params))[0], np.float64)
-    theta, not_yet = np.log(start), np.full(num_updates + 1, np.nan)
+    theta = parameters.flatten_params(parameters.as_params(params, transforms), transforms)
+    not_yet = np.full(num_updates + 1, np.nan)
+    trainable = parameters.trainable_mask(params, frozen, transforms)
     return TuneState(
         step=np.int64(0),
         theta=theta,
-        optimizer_state=optimizer.init(jnp.asarray(theta[trainable_mask(params, frozen)])),
+        optimizer_state=optimizer.init(jnp.asarray(theta[trainable])),
         theta_history=np.full((num_updates + 1, theta.size), np.nan),
         loss=not_yet,
         heldout=not_yet,
@@ -93,24 +92,29 @@ def check_state(state: TuneState, num_params: int, num_updates: int) -> None:
         )
 
 
-def result(state: TuneState, params: NoiseParams, *, whole: bool = True) -> TuneResult:
+def result(
+    state: TuneState, params: Any, *, whole: bool = True, transforms: Any = None
+) -> TuneResult:
     """Result of the evaluations so far.
 
     Args:
         state: After one evaluation at least.
-        params: Any noise with the same parameters, for its fields and precision.
-        whole: Whether each step evaluated all episodes, so that their losses are comparable.
+        params: Any parameters in the same tree, for its structure and precision.
+        whole: Whether each step evaluated all sequences, so that their losses are comparable.
+        transforms: Of the parameters.
     """
     count = int(state.step)
-    like, unravel = ravel_pytree(params)
-    thetas = jnp.asarray(state.theta_history[:count], like.dtype)
     best = _best(state, whole)
+    history = [
+        parameters.unflatten_params(theta, params, transforms)
+        for theta in state.theta_history[:count]
+    ]
     return TuneResult(
-        params=constrain(unravel(thetas[best])),
+        params=history[best],
         best=best,
         loss=state.loss[:count],
         heldout=state.heldout[:count],
-        history=constrain(jax.vmap(unravel)(thetas)),
+        history=jax.tree.map(lambda *x: jnp.stack(x), *history),
         skipped=state.skipped[:count],
     )
 

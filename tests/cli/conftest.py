@@ -11,7 +11,7 @@ from jaxslam.tuning import fitting
 def refused_by_tune(tmp_path, capsys, monkeypatch):
     """Function that runs bad arguments, checks how they are refused, and returns the line."""
     monkeypatch.setattr(tune_command, "enable_caches", lambda: None)
-    monkeypatch.setattr(fitting, "gradients", lambda *_: pytest.fail("work has begun"))
+    monkeypatch.setattr(fitting, "gradients_of", lambda *_: pytest.fail("work has begun"))
 
     def refuse(*arguments, out=None):
         fresh = out is None

@@ -10,8 +10,8 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import episode_from_arrays
 from jaxslam.pipeline.stacking import stack_episodes
-from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors
-from jaxslam.tuning.inputs import as_episodes, prepare
+from jaxslam.tuning import fitting, losses, optimizers, standard_errors
+from jaxslam.tuning.inputs import as_episodes
 
 B, T, M, L = 3, 4, 2, 5
 CONFIG = Config.for_landmark_sensor(L, M)
@@ -52,7 +52,10 @@ def with_features(**changes):
 
 
 BAD_ARGUMENTS = [
-    ((PARAMS, CONFIG, EPISODES), "config is NoiseParams, not Config; the order is config, params"),
+    (
+        (PARAMS, CONFIG, EPISODES),
+        "config is NoiseParams, not Config or a tuning.Model; the order is config, params",
+    ),
     ((CONFIG.filter, PARAMS, EPISODES), "config is FilterConfig, not Config"),
     ((CONFIG, EPISODES, PARAMS), "params is Episode, not NoiseParams"),
     ((CONFIG, dict(PARAMS._asdict()), EPISODES), "params is dict, not NoiseParams"),
@@ -177,8 +180,6 @@ def test_the_default_optimiser_and_the_names_refuse_what_they_do_not_know():
             optimizers.default_optimizer(bad, whole=False)
     with pytest.raises(ValueError, match="whole is None, not True or False"):
         optimizers.default_optimizer(3, whole=None)
-    with pytest.raises(ValueError, match="params is Config, not NoiseParams"):
-        parameters.param_names(CONFIG)
 
 
 def test_the_default_optimiser_is_one_object_for_the_same_arguments():
@@ -230,6 +231,6 @@ def test_episodes_that_need_no_change_are_not_copied():
 
 def test_a_list_of_single_episodes_and_the_name_of_a_loss_are_taken():
     singles = [jax.tree.map(lambda x: np.asarray(x)[k], EPISODES) for k in range(B)]  # noqa: B023
-    _, stacked, function = prepare(CONFIG, PARAMS, singles, "innovation_nll")
-    assert function is losses.innovation_nll
-    jax.tree.map(np.testing.assert_array_equal, stacked, as_episodes(EPISODES))
+    problem = fitting.prepare(CONFIG, PARAMS, singles, "innovation_nll")
+    assert problem.loss is losses.innovation_nll
+    jax.tree.map(np.testing.assert_array_equal, problem.data, as_episodes(EPISODES))

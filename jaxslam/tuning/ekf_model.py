@@ -290,10 +290,12 @@ def _check(
     bad = ~np.isfinite(y) & (True if mask is None else np.asarray(mask))
     if bad.any():
         at = np.argwhere(bad)[0].tolist()
-        raise ValueError(f"{name}.measurements{at} is {y[tuple(at)]}; say in the mask that it is not there")
+        value, advice = y[tuple(at)], "say in the mask what was not measured"
+        raise ValueError(f"{name}.measurements{at} is {value}; {advice}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(data.inputs):
         own = f"{name}.inputs{jax.tree_util.keystr(path)}"
-        check_array(own, leaf, (*y.shape[:2], ...))
+        if np.shape(leaf)[:2] != y.shape[:2]:
+            raise ValueError(f"{own} is {leaf.dtype} {np.shape(leaf)}, not {y.shape[:2]} and more")
         if leaf.dtype.kind == "f" and not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"{own} holds numbers that are not finite")
     return params, data

@@ -28,6 +28,7 @@ from jaxslam.tuning import parameters
 from jaxslam.tuning.inputs import check_alike
 from jaxslam.tuning.losses import Loss, check_loss, default_loss, model_for, resolve
 from jaxslam.tuning.model import Model, num_steps, run_model
+from jaxslam.tuning.model_checks import check_model
 from jaxslam.tuning.optimizers import default_optimizer
 from jaxslam.tuning.parameters import constrain, trainable_mask, unconstrain, unflatten_params
 from jaxslam.tuning.priors import FlatPrior, flatten_prior
@@ -39,7 +40,8 @@ from jaxslam.tuning.tune_state import check_state, record, stalled
 from jaxslam.tuning.tune_state import init as init
 from jaxslam.tuning.tune_state import result as result
 
-SEQUENCE_BATCH = 4  # sequences that a device differentiates together; bounds memory
+SEQUENCE_BATCH = 4  # episodes that a device differentiates together; bounds memory
+SMALL_BATCH = 512  # sequences of other models, whose states are small
 
 Transforms = tuple[Transform, ...]
 
@@ -87,6 +89,8 @@ def prepare(
     params, stacked = model.check(params, data, name)
     used = of_leaves(params, transforms)
     arrays = parameters.as_params(params, transforms)
+    if not isinstance(model.check, SlamCheck):  # whose functions fit, and take long to trace
+        check_model(model, arrays, jax.tree.map(lambda x: x[0], stacked))
     function = default_loss(stacked) if loss is None else resolve(loss)
     check_loss(function, stacked, name=name, model=model)
     return Problem(model_for(function, model), function, used, arrays, stacked)
@@ -107,8 +111,12 @@ def _value_and_gradient(
     return value, ravel_pytree(gradient)[0]
 
 
-_VALUES = DeviceMap(_value, size=SEQUENCE_BATCH, static=3)
-_GRADIENTS = DeviceMap(_value_and_gradient, size=SEQUENCE_BATCH, static=3)
+_VALUES, _SMALL_VALUES = (
+    DeviceMap(_value, size=size, static=3) for size in (SEQUENCE_BATCH, SMALL_BATCH)
+)
+_GRADIENTS, _SMALL_GRADIENTS = (
+    DeviceMap(_value_and_gradient, size=size, static=3) for size in (SEQUENCE_BATCH, SMALL_BATCH)
+)
 
 
 def values(
@@ -131,7 +139,8 @@ def values_of(problem: Problem) -> np.ndarray:
     """`values` of a problem that is checked."""
     model, loss, transforms, params, data = problem
     theta = unconstrain(params, transforms)
-    return np.asarray(_VALUES(model, loss, transforms, theta, data), np.float64)
+    run = _VALUES if isinstance(model.check, SlamCheck) else _SMALL_VALUES
+    return np.asarray(run(model, loss, transforms, theta, data), np.float64)
 
 
 def gradients(
@@ -154,7 +163,8 @@ def gradients_of(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """`gradients` of a problem that is checked."""
     model, loss, transforms, params, data = problem
     theta = unconstrain(params, transforms)
-    value, gradient = _GRADIENTS(model, loss, transforms, theta, data)
+    run = _GRADIENTS if isinstance(model.check, SlamCheck) else _SMALL_GRADIENTS
+    value, gradient = run(model, loss, transforms, theta, data)
     return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
 
 

@@ -70,7 +70,7 @@ class OdometryWeights(NamedTuple):
 
 
 WEIGHTS = {"odometry_weights": OdometryWeights, "measurement_weights": MeasurementWeights}
-"""Records of weights by the fields of `NoiseParams` that hold them."""
+"""Types of weights by the fields of `NoiseParams` that hold them."""
 
 
 def incidence(features: Features) -> Array:

@@ -43,10 +43,11 @@ def check_model(model: Model, params: Any, sequence: Any) -> None:
                 f"model.step(params, state, now): state{_name(path)} is {new} after the step and "
                 f"{old} before it; both must be the same"
             )
-    if jax.tree.structure(state) != jax.tree.structure(result[0]):
+    wanted, found = str(jax.tree.structure(state)), str(jax.tree.structure(result[0]))
+    if found != wanted:
         raise ValueError(
             "model.step(params, state, now) returns another structure than its state: "
-            f"{jax.tree.structure(result[0])}, not {jax.tree.structure(state)}"
+            f"{found}, not {wanted}"
         )
 
 

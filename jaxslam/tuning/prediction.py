@@ -225,7 +225,7 @@ def run_twice(model: Model, loss: Comparison) -> Model:
     if isinstance(model.step, _Step):
         return model
     init, step = cast(Any, (_Init(model.init), _Step(model.step, loss)))
-    return Model(init, step, model.inputs, model.check)
+    return model._replace(init=init, step=step)
 
 
 def _difference_nll(info: Memories, steps: int) -> Array:

@@ -46,7 +46,7 @@ CORNER_CONFIG = CONFIG._replace(filter=CONFIG.filter._replace(landmark_kinds=(CO
 def true_params() -> NoiseParams:
     """Q and R that the drives are simulated with."""
     return NoiseParams(
-        odometry_coefficients=jnp.asarray(wheel_coefficients(*Robot()), float),
+        odometry_coefficients=jnp.asarray(wheel_coefficients(*Robot()[:2]), float),
         range_std=jnp.asarray(0.01, float),
         bearing_std=jnp.asarray(0.005, float),
         feature_std_scale=jnp.asarray(1.0, float),
@@ -135,7 +135,7 @@ def measure(
     error = jnp.einsum("mij,mj->mi", roots, jax.random.normal(keys[1], exact.shape, exact.dtype))
     one = jnp.ones_like(scale)  # a wall's direction is one number
     error = error * jnp.stack([one, jnp.where(is_wall, 0.0, one)], axis=1)
-    ids = jnp.append(order, jnp.int32(NUM_LANDMARKS))
+    ids = jnp.append(order, jnp.int32(len(positions)))
     return zero_padding(features(exact + error)), jnp.where(valid, ids, -1)
 
 

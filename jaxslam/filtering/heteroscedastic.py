@@ -70,7 +70,7 @@ class OdometryWeights(NamedTuple):
 
 
 WEIGHTS = {"odometry_weights": OdometryWeights, "measurement_weights": MeasurementWeights}
-"""All records of weights by the fields of `NoiseParams` that hold them."""
+"""Types of weights by the fields of `NoiseParams` that hold them."""
 
 
 def incidence(features: Features) -> Array:

@@ -11,15 +11,21 @@ a normalised density, so that its logarithm is a proper score, and nu can be tun
 infinity it is that of the Gaussian. S is then a matrix of scales: the covariance is
 nu / (nu - 2) S for nu > 2.
 
-The update is a step of iteratively reweighted least squares, from the prediction: R of feature i is
-divided by
+The update is a step of iteratively reweighted least squares, from the prediction. A t distribution
+is a Gaussian of covariance S_ii / w with a random w, which is expected to be
 
     w_i = (nu + n_i) / (nu + d_i^2),       d_i^2 = v_i^T S_ii^-1 v_i
 
-The mean of w_i is 1 if v_i has this distribution: what is near is trusted more, what is far away
-less. Approximated are: the sum of a Gaussian and a Student t distribution, by one t of both scales;
-the innovations of a scan, as uncorrelated rather than of one common heavy tail; the posterior, by a
-Gaussian of one iteration. Data association, and the test of matches, are Gaussian as before.
+What S_ii / w_i exceeds S_ii by is noise of the measurement, where w_i is below 1:
+
+    R_i' = R_i + max(1 / w_i - 1, 0) S_ii
+
+so that the robot follows an innovation far off by a share w_i of the gain. To divide R_i alone by
+w_i would not do: where the pose is uncertain R_i is small beside S_ii, and a wrong landmark would
+be followed all the same. What is near is not trusted more. Approximated are: the sum of a Gaussian
+and a Student t distribution, by one t of both scales; the innovations of a scan, as uncorrelated
+rather than of one common heavy tail; the posterior, by a Gaussian of one iteration. Data
+association, and the test of matches, are Gaussian as before.
 
 References:
     Lange, Little, Taylor (1989), Robust statistical modeling using the t distribution. Roth,
@@ -38,21 +44,23 @@ from jaxslam.filtering.kalman import innovation_cov
 
 
 class Score(NamedTuple):
-    """How well innovations were predicted; both are 0 where S is not positive definite.
+    """How well innovations were predicted; all are 0 where S is not positive definite.
 
     Attributes:
         nis: () v^T S^-1 v, with the R that no weight has changed.
         log_likelihood: () [nats] log-density of the innovations.
+        logdet: () log det S, of the same S.
     """
 
     nis: Array
     log_likelihood: Array
+    logdet: Array
 
 
 def reweight(
     student_dof: Array, cov: CovarianceBlocks, rows: LinearizedMeasurements, size: Array
 ) -> tuple[LinearizedMeasurements, Score]:
-    """Rows with the R of each feature divided by its weight, and the score of the innovations.
+    """Rows with the R of each feature by its weight, and the score of the innovations.
 
     Args:
         student_dof: () nu, degrees of freedom, above 0.
@@ -68,11 +76,14 @@ def reweight(
     white = root @ rows.residual.reshape(-1)
     square = jnp.sum(white.reshape(-1, 2) ** 2, axis=1)
     density = jnp.sum(student_log_density(student_dof, square, size)) - 0.5 * logdet
-    weight = student_weight(student_dof, _own_squares(s, rows.residual), size)
-    scaled = rows.R / weight[:, None, None]
-    R = jnp.where(size[:, None, None] > 0, scaled, rows.R)
+    count = len(size)
+    index = jnp.arange(count, dtype=jnp.int32)
+    own = s.reshape(count, 2, count, 2)[index, :, index]
+    weight = student_weight(student_dof, _own_squares(own, rows.residual), size)
+    excess = jnp.where(size > 0, jnp.maximum(1.0 / weight - 1.0, 0.0), 0.0)
+    R = rows.R + excess[:, None, None] * own
     good &= jnp.isfinite(density)
-    score = Score(jnp.where(good, jnp.sum(square), 0.0), jnp.where(good, density, 0.0))
+    score = Score(*(jnp.where(good, x, 0.0) for x in (jnp.sum(square), density, logdet)))
     return rows._replace(R=R), score
 
 
@@ -97,11 +108,8 @@ def student_log_density(student_dof: Array, square: Array, size: Array) -> Array
     return gamma - n / 2 * jnp.log(nu * math.pi) - tail
 
 
-def _own_squares(s: Array, residual: Array) -> Array:
-    """d_i^2 (K,) by the diagonal blocks of S (2 K, 2 K) and the innovations (K, 2)."""
-    count = len(residual)
-    index = jnp.arange(count, dtype=jnp.int32)
-    block = s.reshape(count, 2, count, 2)[index, :, index]
+def _own_squares(block: Array, residual: Array) -> Array:
+    """d_i^2 (K,) by the diagonal blocks (K, 2, 2) of S and the innovations (K, 2)."""
     a, b, d = block[:, 0, 0], block[:, 0, 1], block[:, 1, 1]
     x, y = residual[:, 0], residual[:, 1]
     determinant = a * d - b * b

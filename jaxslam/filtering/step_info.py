@@ -30,6 +30,8 @@ class StepInfo(NamedTuple):
         num_pruned: () int32 number of landmarks that were pruned, unconfirmed ones included.
         num_evicted: () int32 number of unconfirmed landmarks that were evicted from a full map.
         num_merged: () int32 number of duplicates that were merged.
+        logdet: () log-determinant of the innovation covariance, of scales, with
+            `params.student_dof`; None without, where it follows from `log_likelihood` and `nis`.
         noise_factors: (2,) factors on the standard deviations of Q and R from the next step on;
             None where they do not adapt.
         odometry_bias: (3,) biases of odometry (`odometry_bias`); None where there are none.
@@ -49,6 +51,7 @@ class StepInfo(NamedTuple):
     num_pruned: Array
     num_evicted: Array
     num_merged: Array
+    logdet: Array | None = None
     noise_factors: Array | None = None
     odometry_bias: Array | None = None
     odometry_bias_cov: Array | None = None
@@ -92,6 +95,7 @@ def step_info(
         num_pruned=pruned,
         num_evicted=evicted,
         num_merged=merged,
+        logdet=None if score is None else jnp.where(result.ok, score.logdet, 0.0),
         noise_factors=None if belief.adaptation is None else belief.adaptation.factors,
         odometry_bias=None if belief.bias is None else belief.bias.mean,
         odometry_bias_cov=None if belief.bias is None else belief.bias.cov,

@@ -1,5 +1,6 @@
 """Simulated drives: a robot that follows a path, its odometry and its scans."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -35,39 +36,62 @@ def start_pose(path: Array) -> Array:
 
 
 def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array, Array]:
-    """Drive along a path by pure pursuit, steered by the true pose.
+    """Drive along a path by pure pursuit, steered by the true pose of the robot.
+
+    The robot stands still before the first scan and after the last one, by the odometry's clock.
 
     Args:
         key: Of the encoder noise.
-        robot: With its encoder noise.
-        path: (N, 2) [m, world].
+        robot: With its encoder noise and systematic errors.
+        path: (N, 2) [m, world] of the point between its wheels.
         num_scans: T, number of scans.
 
     Returns:
-        True poses (T, 3) [m, m, rad] in the world and odometry increments (T, 3), zero at the
-        first.
+        True poses (T, 3) [m, m, rad] of the scanner in the world, and increments (T, 3) of the
+        robot as odometry reports them, zero at the first.
     """
     first = start_pose(path)
     draws = jax.random.normal(key, (num_scans - 1, SUBSTEPS, 2), path.dtype)
+    late = robot.time_offset / robot.scan_period  # [scans]
+    whole, part = math.floor(late), late - math.floor(late)
 
     def body(carry: tuple[Array, Array], draw: Array) -> tuple[tuple[Array, Array], Any]:
         pose, path_index = carry
         odometry, path_index = path_following.pure_pursuit(path, path_index, pose)
+        between = pose
+        if part:
+            between = compose(pose, true_increment(robot, draw, odometry, part=part))
         pose = compose(pose, true_increment(robot, draw, odometry))
-        return (pose, path_index), (pose, odometry)
+        return (pose, path_index), (pose, odometry, between)
 
-    _, (poses, odometry) = lax.scan(body, (first, jnp.int32(0)), draws)
-    return jnp.concatenate([first[None], poses]), jnp.pad(odometry, ((1, 0), (0, 0)))
+    _, (poses, odometry, between) = lax.scan(body, (first, jnp.int32(0)), draws)
+    poses = jnp.concatenate([first[None], poses])
+    if late:
+        at = np.arange(num_scans) + whole
+        poses = jnp.concatenate([between, poses[-1:]])[np.clip(at, 0, num_scans - 1)]
+        poses = jnp.where((at < 0)[:, None], first[None], poses)
+    if robot.mount != (0.0, 0.0, 0.0):
+        poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(robot.mount, path.dtype))
+    return poses, jnp.pad(odometry, ((1, 0), (0, 0)))
 
 
 def num_scans_of_drive(robot: Robot, path: Any) -> int:
-    """Number of scans on a noise-free drive to the end of a path (N, 2)."""
+    """Number of scans on a noise-free drive to the end of a path (N, 2).
+
+    Raises:
+        ValueError: The robot or the path is not possible, or the robot does not arrive.
+    """
     points = arguments.as_path(path, None)
     noise_free = arguments.as_robot(robot)._replace(encoder_noise=0.0)
     upper_bound = 40 + int(4 * np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)) / 0.3)
     simulated = jax.jit(partial(drive, num_scans=upper_bound), static_argnums=1)
     _, odometry = simulated(jax.random.key(0), noise_free, points)
     moving = np.abs(np.asarray(odometry)[1:]).sum(axis=1) > 0
+    if moving.all():
+        raise ValueError(
+            f"robot does not arrive at the end of the path in {upper_bound} scans; its "
+            f"wheel_scales are {robot.wheel_scales}, its wheel_base_scale {robot.wheel_base_scale}"
+        )
     return 1 + int(moving.sum())
 
 

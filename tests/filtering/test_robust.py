@@ -78,19 +78,36 @@ def test_many_degrees_of_freedom_are_a_gaussian():
     found, score = robust.reweight(jnp.array(1e9), cov, rows, SIZE)
     expected = gaussian.logpdf(np.asarray(rows.residual).ravel()[used])
     np.testing.assert_allclose(score.log_likelihood, expected, rtol=1e-6)
-    np.testing.assert_allclose(found.R, rows.R, rtol=1e-6)
+    np.testing.assert_allclose(found.R, rows.R, rtol=1e-6, atol=1e-9)
 
 
-def test_a_weight_is_that_of_the_own_innovation():
+def test_the_innovation_far_off_has_the_covariance_of_its_weight():
     cov, rows = problem()
+    rows = rows._replace(residual=rows.residual * jnp.array([[1.0], [9.0], [9.0], [1.0]]))
     s = np.asarray(innovation_cov(cov, rows))
     found, _ = robust.reweight(jnp.array(3.0), cov, rows, SIZE)
-    v = np.asarray(rows.residual)
+    robust_s = np.asarray(innovation_cov(cov, found))
+    v, far = np.asarray(rows.residual), []
     for i, n in enumerate((2, 1, 2)):
         own = slice(2 * i, 2 * i + n)
         weight = (3.0 + n) / (3.0 + v[i, :n] @ np.linalg.solve(s[own, own], v[i, :n]))
-        np.testing.assert_allclose(found.R[i], rows.R[i] / weight)
+        np.testing.assert_allclose(robust_s[own, own], s[own, own] / min(weight, 1.0))
+        far.append(weight < 1.0)
+    assert any(far) and not all(far)
     np.testing.assert_array_equal(found.R[3], rows.R[3])
+
+
+def test_an_uncertain_robot_does_not_follow_a_wrong_landmark():
+    """Innovation 3, P = 0.3^2, R = 0.01^2: by R / w it would move by 2.9."""
+    one = jnp.zeros((1, 2, 3)).at[0, 0, 2].set(1.0)
+    cov = CovarianceBlocks(0.09 * jnp.eye(3), jnp.zeros((3, 2)), jnp.zeros((2, 2)))
+    R = jnp.diag(jnp.array([1e-4, 1.0]))[None]
+    rows = LinearizedMeasurements(
+        jnp.array([[3.0, 0.0]]), one, jnp.zeros((1, 2, 2)), R, jnp.zeros(1, jnp.int32)
+    )
+    found, _ = robust.reweight(jnp.array(4.0), cov, rows, jnp.array([1], jnp.int32))
+    moved = 3.0 * 0.09 / (0.09 + float(found.R[0, 0, 0]))
+    np.testing.assert_allclose(moved, 3.0 * 0.09 / (0.09 + 1e-4) * 5 / (4 + 9 / 0.0901), rtol=1e-6)
 
 
 def test_derivatives_are_those_of_differences():

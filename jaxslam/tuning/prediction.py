@@ -224,8 +224,9 @@ def run_twice(model: Model, loss: Comparison) -> Model:
     """The model run beside itself with less memory, as the loss needs it; infos are `Memories`."""
     if isinstance(model.step, _Step):
         return model
+    # mypy does not see that a NamedTuple can be called.
     init, step = cast(Any, (_Init(model.init), _Step(model.step, loss)))
-    return Model(init, step, model.inputs, model.check)
+    return model._replace(init=init, step=step)
 
 
 def _difference_nll(info: Memories, steps: int) -> Array:

@@ -56,7 +56,7 @@ def chain(seed: int, num_trials: int, repeats: int) -> tuple[common.Numbers, Sca
     config = Config()
     lidar = config.frontend.lidar
     world, robot, path, num_scans = common.drive_in()
-    params = NoiseParams.for_simulated_robot(*robot)
+    params = NoiseParams.for_simulated_robot(*robot[:2])
     keys = trials.trial_keys(jax.random.key(seed), np.arange(num_trials))
 
     def simulate(keys: Key) -> Episode:

@@ -78,7 +78,7 @@ def noisy_odometry(poses: np.ndarray, robot: Robot, seed: int) -> np.ndarray:
     increments, random = [np.zeros(3)], np.random.default_rng(seed)
     for a, b in zip(jnp.asarray(poses[:-1], float), jnp.asarray(poses[1:], float), strict=True):
         exact = relative(a, b)
-        cov = np.asarray(odometry_cov(wheel_coefficients(*robot), exact), np.float64)
+        cov = np.asarray(odometry_cov(wheel_coefficients(*robot[:2]), exact), np.float64)
         increments.append(random.multivariate_normal(np.asarray(exact), (cov + cov.T) / 2))
     return np.array(increments)
 
@@ -109,7 +109,7 @@ def explore(
     """
     robot = Robot()
     poses = jnp.asarray(scan_poses, float)
-    params = NoiseParams.for_simulated_robot(*robot)._replace(
+    params = NoiseParams.for_simulated_robot(*robot[:2])._replace(
         range_std=jnp.asarray(RANGE_STD, float), bearing_std=jnp.asarray(BEARING_STD, float)
     )
     scans = scans_from(jax.random.key(seed), poses, jnp.asarray(walls, float))

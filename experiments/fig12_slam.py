@@ -132,7 +132,7 @@ def wall_clearance(walls: np.ndarray, points: np.ndarray) -> float:
 def compute(seed: int) -> common.Numbers:
     """Drive out and home: trajectories, estimates, errors, and the map."""
     world, robot, tour, _ = common.drive_in()
-    params, walls = NoiseParams.for_simulated_robot(*robot), np.asarray(world.walls, float)
+    params, walls = NoiseParams.for_simulated_robot(*robot[:2]), np.asarray(world.walls, float)
     out_key, home_key = jax.random.split(jax.random.key(seed))
     first = drives.start_pose(tour)
     belief = init(CONFIG.filter, first)

@@ -136,7 +136,7 @@ def latency(seed: int, num_trials: int) -> tuple[Numbers, Episode]:
     episodes = trials.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
     episode = jax.tree.map(lambda x: x[0], episodes)
     small = config.filter._replace(max_landmarks=64)
-    params, belief = NoiseParams.for_simulated_robot(*robot), init(small, episode.truth[0])
+    params, belief = NoiseParams.for_simulated_robot(*robot[:2]), init(small, episode.truth[0])
     step, scan_at = jax.jit(slam_filter.step, static_argnums=0), jax.jit(cast, static_argnums=0)
     extract_features = jax.jit(extract.extract_features, static_argnums=0)
     step_seconds, frontend_seconds = [], []

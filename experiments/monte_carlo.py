@@ -85,7 +85,7 @@ class Trials:
     def __init__(self, case: Case):
         """Prepare key, world, path and noise parameters."""
         self.key = jax.random.key(case.seed)
-        self.params = NoiseParams.for_simulated_robot(*case.robot)
+        self.params = NoiseParams.for_simulated_robot(*case.robot[:2])
         self._case = case
         self._world = World(jnp.asarray(case.walls, float))
         self._path = jnp.asarray(case.path, float)

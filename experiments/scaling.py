@@ -37,7 +37,7 @@ def chain(seed: int, runs: int, steps: int, landmarks: int, pinned: bool) -> Num
     timing.pin() if pinned else timing.unpin()
     world, robot, path, _ = common.drive_in()
     config = Config(filter=FilterConfig(max_landmarks=landmarks))
-    params = NoiseParams.for_simulated_robot(*robot)
+    params = NoiseParams.for_simulated_robot(*robot[:2])
     key = jax.random.key(seed)
 
     def run(count: int) -> float:

@@ -11,7 +11,7 @@ from jaxslam.core.se2 import compose, range_bearing, relative, wrap_angle
 from jaxslam.core.types import JUNCTION
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.motion_model import odometry_cov
-from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.noise import NoiseParams, measurement_cov
 from jaxslam.filtering.odometry_bias import correct_odometry
 from jaxslam.frontend.features import features_from_range_bearing
 
@@ -28,7 +28,7 @@ def drive(key, params=PARAMS, bias=None, *, steps):
 
     Args:
         key: Of the noise.
-        params: Of Q, and of R by its two standard deviations.
+        params: Of Q, by its coefficients, and of R.
         bias: (3,) of the odometry.
         steps: T.
     """
@@ -39,9 +39,11 @@ def drive(key, params=PARAMS, bias=None, *, steps):
         reported = COMMAND if bias is None else correct_odometry(bias, COMMAND)
         pose = compose(pose, reported + root @ jax.random.normal(keys[0], (3,)))
         offsets = jax.vmap(lambda p: relative(pose, jnp.append(p, 0.0))[:2])(LANDMARKS)
-        std = jnp.stack([params.range_std, params.bearing_std])
         polar = jax.vmap(range_bearing)(offsets)
-        polar += std[None] * jax.random.normal(keys[1], polar.shape)
+        exact = Measurement(COMMAND, features_from_range_bearing(polar, jnp.ones(4, bool)))
+        R = measurement_cov(params, exact.features, exact)
+        std = jnp.sqrt(jnp.diagonal(R, axis1=1, axis2=2))
+        polar += std * jax.random.normal(keys[1], polar.shape)
         polar = jnp.stack([polar[:, 0], wrap_angle(polar[:, 1])], axis=1)
         return pose, (pose, features_from_range_bearing(polar, jnp.ones(4, bool)))
 

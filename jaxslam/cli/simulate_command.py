@@ -66,7 +66,7 @@ def simulate(
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     robot = Robot()
-    params = read_params(noise, NoiseParams.for_simulated_robot(*robot))
+    params = read_params(noise, NoiseParams.for_simulated_robot(*robot[:2]))
     key = jax.random.key(seed)
     with folder(out) as out_dir:
         enable_caches()

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import summaries
+from jaxslam.cli import calibrated_logs, summaries, tune_report
 from jaxslam.cli.log_options import Scanner, ScannerOptions
 from jaxslam.cli.options import (
     Files,
@@ -27,17 +27,22 @@ from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.episode import Episode
 from jaxslam.core.types import Metrics
-from jaxslam.evaluation import summary
+from jaxslam.evaluation import (
+    ConsistencyReport,
+    filter_with_statistics,
+    slam_consistency,
+    summary,
+)
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.io import checkpoint, noise_file
+from jaxslam.io import calibration_file, checkpoint, noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
-from jaxslam.pipeline import episodes
 from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors, tune_state
 from jaxslam.tuning.losses import Loss
 from jaxslam.tuning.tune_state import TuneResult, TuneState
 
 PARAMS_FILE, CHECKPOINT_FILE = "noise.json", "tune.npz"
+CALIBRATION_FILE = "calibration.json"
 
 
 class _Settings(NamedTuple):
@@ -72,6 +77,7 @@ def tune(
         tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
     ] = (),
     noise: OptionalFile = None,
+    calibrate: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     scanner: Scanner = ScannerOptions(),  # noqa: B008
     seed: int = 0,
     out: OutFolder = Path("out"),
@@ -79,7 +85,8 @@ def tune(
     """Tune the noise parameters of the filter (Q and R) on logs or on simulated trials.
 
     Writes noise.json, which --noise of the other commands reads; metrics.json with the errors
-    before and after, and the standard errors of the parameters; and history.png. When interrupted,
+    before and after, the standard errors of the parameters, and tests of the filter's consistency;
+    history.png; and report.png, all of it on one page, with findings in words. When interrupted,
     noise.json holds the best parameters so far, and the same command resumes the tuning.
 
     The parameters are the four coefficients of the odometry noise (Q); standard deviations of range
@@ -111,6 +118,10 @@ def tune(
             odometry_coefficients[3], range_std, bearing_std, feature_std_scale, wall_angle_std,
             scan_match_std_scale.
         noise: File of the initial noise parameters (Q and R); by default cautious ones.
+        calibrate: Of laser logs of one robot: calibrate it first, its wheels, the scanner's mount
+            and the clocks of both, by scan matching against odometry, and write calibration.json,
+            which --calibration of `jaxslam run` reads. The noise is then that of the calibrated
+            robot.
         scanner: The scanner and the frames of laser logs.
         seed: Random seed of the simulation and of the order of the minibatches.
         out: Folder for the results.
@@ -136,8 +147,11 @@ def tune(
             match_scans=match_scans,
             loss=settings.loss,
             scanner=scanner,
+            calibrate=calibrate,
         )
     else:
+        if calibrate:
+            raise InputError("applies to laser logs only", field="--calibrate")
         if test or reference:
             raise InputError("apply to logs only", field="--test, --reference")
         check_range("--trials", trials, 1, 10**6)
@@ -149,13 +163,18 @@ def tune(
         enable_caches()
         with stopwatch() as seconds:
             job = task.load()
+            if job.robot is not None:
+                calibration_file.write(out_dir / CALIBRATION_FILE, job.robot)
             found = _tune(job, out, settings)
             with _resumable(out, lambda: "all evaluations"):
-                numbers = _evaluate(job, found, settings)
+                numbers, report = _evaluate(job, found, settings)
         numbers |= {"seconds": seconds}
+        if job.robot is not None:
+            numbers["calibration"] = calibrated_logs.metrics_of(job.robot)
         noise_file.write(out_dir / PARAMS_FILE, found.params)
         write_json(out_dir / "metrics.json", numbers)
         _draw_history(out_dir / "history.png", found)
+        tune_report.draw_report(out_dir / "report.png", job.title, numbers, found, report)
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)
     summaries.print_tuning_summary(numbers, job.title, out)
 
@@ -231,22 +250,26 @@ def _resumable(out: Path, done: Callable[[], str | int]) -> Iterator[None]:
         ) from None
 
 
-def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
-    """Errors before and after the tuning, and standard errors of the parameters."""
+def _evaluate(
+    job: TuneJob, found: TuneResult, settings: _Settings
+) -> tuple[Metrics, tune_report.TuneReport]:
+    """Errors and consistency before and after the tuning, standard errors of the parameters."""
     evaluated = job.train if job.test is None else job.test
 
-    def errors(params: NoiseParams) -> Metrics:
+    def errors(params: NoiseParams) -> tuple[Metrics, ConsistencyReport | None]:
         loss = fitting.values(job.config, params, evaluated, settings.loss)
         numbers: Metrics = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
+        results, statistics = filter_with_statistics(job.config, params, evaluated)
         if evaluated.truth_mask is None or evaluated.truth_mask.any():
-            results = episodes.filter_episodes(job.config, params, evaluated)
             numbers |= summary.evaluate(results)
-        return numbers
+        return numbers, slam_consistency(results, statistics)
 
     print("evaluating errors before and after, and standard errors ...", flush=True)
-    numbers = errors(found.params) | {
+    numbers, after = errors(found.params)
+    numbers_before, before = errors(job.params)
+    numbers |= {
         "judged_on": "the runs it was tuned on" if job.test is None else "held-out runs",
-        "before": errors(job.params) | {"noise": noise_file.to_keys(job.params)},
+        "before": numbers_before | {"noise": noise_file.to_keys(job.params)},
         "evaluations": len(found.loss),
         "best": found.best,
         "skipped": int(found.skipped.sum()),
@@ -254,6 +277,7 @@ def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
         "standard_errors": None,
         "warnings": ["no standard errors: they need two episodes at least"],
     }
+    sure = None
     if len(job.train.odometry) >= 2:
         sure = standard_errors.standard_errors(
             job.config, found.params, job.train, loss=settings.loss, frozen=settings.frozen
@@ -261,7 +285,15 @@ def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
         keys = map(noise_file.key_of, sure.names)
         numbers["standard_errors"] = dict(zip(keys, sure.relative.tolist(), strict=True))
         numbers["warnings"] = list(sure.warnings)
-    return numbers
+    report = tune_report.TuneReport(
+        before=before,
+        after=after,
+        start=job.params,
+        found=found.params,
+        frozen=~parameters.trainable_mask(found.params, settings.frozen),
+        errors=sure,
+    )
+    return numbers | tune_report.report_blocks(report), report
 
 
 def _hash(episodes: Episode | None) -> str:

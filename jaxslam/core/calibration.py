@@ -4,10 +4,12 @@ Odometry that is off by 5 % is off by 5 % at every step, and no noise says so. A
 by numbers that are the same throughout a drive. It turns the increments that the wheels report into
 increments of the scanner; everything after it works on these:
 
-    reported  --shift in time-->  --scales-->  true motion u of the robot  -->  M^-1 (+) u (+) M
+    reported  --scales-->  --shift in time-->  true motion u of the robot  -->  M^-1 (+) u (+) M
 
-with M the pose of the scanner on the robot. All of it is differentiable. The functions take arrays
-of NumPy (float64, for logs) and of JAX alike, and return what they are given.
+with M the pose of the scanner on the robot. The scales come first, because the wheels roll on an
+arc between two scans; the motion between two shifted times, of parts of two arcs, is on none. All
+of it is differentiable. The functions take arrays of NumPy (float64, for logs) and of JAX alike,
+and return what they are given.
 
 References:
     Borenstein, Feng (1996), Measurement and correction of systematic odometry errors in mobile
@@ -104,11 +106,11 @@ def calibrate_odometry(
     xp = odometry.__array_namespace__()
     taken = xp.zeros(3, dtype=odometry.dtype) if mount is None else xp.asarray(mount)
     of_robot = _change_frame(odometry, _inverse(taken))
+    of_robot = scale_increments(calibration, of_robot, wheel_base=wheel_base)
     if times is not None:
         of_robot = _shift(of_robot, times, calibration.time_offset)
-    scaled = scale_increments(calibration, of_robot, wheel_base=wheel_base)
     true = _compose(taken, xp.asarray(calibration.mount, dtype=odometry.dtype))
-    moved = _change_frame(scaled, true)
+    moved = _change_frame(of_robot, true)
     return xp.where(xp.arange(len(moved))[:, None] > 0, moved, xp.zeros_like(moved))
 
 
@@ -143,18 +145,30 @@ def _shift(odometry: Any, times: Any, offset: Any) -> Any:
     xp = odometry.__array_namespace__()
     if len(odometry) < 2:
         return odometry
-    wanted = times + offset
+    wanted = xp.clip(times + offset, times[0], times[-1])
     after = xp.clip(xp.searchsorted(times, wanted, side="right"), 1, len(times) - 1)
     begin, end = times[after - 1], times[after]
     apart = end > begin
     fraction = xp.where(apart, (wanted - begin) / xp.where(apart, end - begin, 1.0), 0.0)
-    fraction = xp.clip(fraction, 0.0, 1.0)
-    reckon = se2_np.dead_reckoning if xp is np else se2.dead_reckoning
-    poses = reckon(xp.zeros(3, dtype=odometry.dtype), odometry)
+    poses = reckon(odometry)
     inside = _part(odometry[after], fraction.astype(odometry.dtype))
     shifted = _compose(poses[after - 1], inside)
     moved = _relative(shifted[:-1], shifted[1:])
     return xp.concat([xp.zeros((1, 3), dtype=odometry.dtype), moved])
+
+
+def reckon(increments: Any) -> Any:
+    """`se2.dead_reckoning` (T, 3) from the origin in either namespace; in NumPy by sums, for speed.
+
+    Args:
+        increments: (T, 3) [m, m, rad].
+    """
+    xp = increments.__array_namespace__()
+    if xp is not np:  # sums of T numbers take long to compile
+        return se2.dead_reckoning(xp.zeros_like(increments[0]), increments)
+    heading = xp.cumsum(increments[:, 2])
+    moved = _rotate(increments[:, :2], heading - increments[:, 2])
+    return xp.concat([xp.cumsum(moved, axis=0), heading[:, None]], axis=1)
 
 
 def _part(increments: Any, fraction: Any) -> Any:

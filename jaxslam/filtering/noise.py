@@ -102,7 +102,7 @@ class NoiseParams(NamedTuple):
         return cls(*_arrays([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03))
 
 
-def _arrays(*numbers: Any) -> Iterator[Array]:
+def _arrays(*numbers: Any) -> Iterator[Any]:
     """Numbers as arrays of JAX's default float type."""
     return (jnp.asarray(x, float) for x in numbers)
 

@@ -80,17 +80,17 @@ def step(
     return _compiled_step(config, params, belief, measurement)
 
 
-def _step(
+def unchecked_step(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> tuple[Belief, StepInfo]:
-    """`step`, of inputs that are checked."""
+    """`step` of inputs that are checked; not jitted, for a scan over time."""
     is_known = measurement.landmark_ids is not None
     if is_known:
         config = config._replace(confirm_count=1, wall_confirm_count=1)
     features, features_cov = _select(config, params, measurement)
     if belief.adaptation is not None:
         features_cov *= jnp.exp(belief.adaptation.log_variance[1])
-    predicted, odometry_cov = _predict(config, params, belief, measurement)
+    predicted, odometry_cov = predict(config, params, belief, measurement)
     found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
     matches = _choose(config, predicted, features, found.slot)
     chosen, rows = _linearise(config, predicted, features, features_cov, matches)
@@ -116,7 +116,7 @@ def _step(
     return mapped, info
 
 
-_compiled_step = partial(jax.jit, static_argnames="config")(_step)
+_compiled_step = partial(jax.jit, static_argnames="config")(unchecked_step)
 
 
 def _select(
@@ -135,10 +135,10 @@ def _select(
     )
 
 
-def _predict(
+def predict(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> tuple[Belief, Array]:
-    """Predict by the odometry increment, and count the step.
+    """Predict by the odometry increment, and count the step: what `unchecked_step` begins with.
 
     Returns:
         The belief, and the covariance Q (3, 3) of the increment in the frame of the pose before it.
@@ -323,6 +323,6 @@ def _run(
     """`run_filter`, of inputs that are checked."""
 
     def body(belief: Belief, now: Measurement) -> tuple[Belief, StepInfo]:
-        return _step(config, params, belief, now)
+        return unchecked_step(config, params, belief, now)
 
     return lax.scan(body, belief, measurements)

@@ -45,8 +45,10 @@ OPTIONAL: Mapping[str, tuple[int, ...]] = MappingProxyType(
     }
 )
 """Shape of each key that a file may have where the template has None; it is read then, too."""
-SIGNED = ("odometry_weights", "measurement_weights")
+SIGNED = ("odometry_weights", "measurement_weights", "custom")
 """Fields whose numbers may be negative or 0."""
+MAY_BE_ZERO = ("odometry_bias_walk",)
+"""Fields whose numbers may be 0, but not negative."""
 COVARIANCES = ("odometry_cov_rate",)
 """Fields that are covariance matrices."""
 
@@ -137,8 +139,9 @@ def read(path: str | PathLike, template: Noise) -> Noise:
     dtype = np.asarray(next(x for x in expected.values() if x is not None)).dtype
     options = {key: np.zeros(shape, dtype) for key, shape in OPTIONAL.items()}
     options = {key: like for key, like in options.items() if _holds(template, key)}
-    for key in numbers.keys() - expected.keys() - options.keys():
-        advice = f"the fields are {', '.join([*expected, *(options.keys() - expected.keys())])}"
+    for key in sorted(numbers.keys() - expected.keys() - options.keys()):
+        others = {own.partition(".")[0]: None for own in options if own not in expected}
+        advice = f"the fields are {', '.join([*expected, *others])}"
         raise InputError("unknown field", path=path, field=key, advice=advice)
     for key, like in expected.items():
         if like is not None and key not in numbers:
@@ -231,6 +234,10 @@ def _check_values(path: str | PathLike, key: str, array: np.ndarray) -> None:
         if field in COVARIANCES and not _is_covariance(array):
             advice = "give a symmetric matrix without negative eigenvalues"
             raise InputError("is no covariance", path=path, field=key, advice=advice)
+    elif field in MAY_BE_ZERO:
+        if not (np.isfinite(array) & (array >= 0.0)).all():
+            advice = "give finite numbers of 0 or more"
+            raise InputError(f"{array.tolist()} is below 0", path=path, field=key, advice=advice)
     elif not (np.isfinite(array) & (array > 0.0)).all():
         advice = "standard deviations are finite and above 0"
         raise InputError(f"{array.tolist()} is not positive", path=path, field=key, advice=advice)

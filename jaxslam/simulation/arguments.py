@@ -32,16 +32,35 @@ def as_robot(robot: Any) -> Robot:
     """The robot with Python's floats, so that it is static under jit.
 
     Raises:
-        ValueError: It is no `Robot`, or has no possible size or noise.
+        ValueError: It is no `Robot`, or one of its fields is not possible.
     """
     if not isinstance(robot, Robot):
         raise ValueError(f"robot is {type(robot).__name__}, not Robot")
-    robot = Robot(*(float(x) for x in robot))
-    if not 0.0 < robot.wheel_base < np.inf:
-        raise ValueError(f"robot.wheel_base is {robot.wheel_base}, not above 0")
+    robot = Robot(*(_plain(*field) for field in robot._asdict().items()))
+    for name in ("wheel_base", "wheel_base_scale", "scan_period"):
+        if not 0.0 < getattr(robot, name) < np.inf:
+            raise ValueError(f"robot.{name} is {getattr(robot, name)}, not above 0")
     if not 0.0 <= robot.encoder_noise < np.inf:
         raise ValueError(f"robot.encoder_noise is {robot.encoder_noise}, not 0 or more")
+    if not all(0.0 < scale < np.inf for scale in robot.wheel_scales):
+        raise ValueError(f"robot.wheel_scales is {robot.wheel_scales}, not two numbers above 0")
+    if not np.isfinite([*robot.mount, robot.time_offset]).all():
+        name = "time_offset" if np.isfinite(robot.mount).all() else "mount"
+        raise ValueError(f"robot.{name} is {getattr(robot, name)}, not finite")
     return robot
+
+
+def _plain(name: str, value: Any) -> Any:
+    """A field of a robot as a float, or as a tuple of floats where the default is one."""
+    shape = np.shape(Robot._field_defaults[name])
+    try:
+        numbers = np.asarray(value, float)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None or numbers.shape != shape:
+        wanted = f"{shape[0]} numbers" if shape else "a number"
+        raise ValueError(f"robot.{name} is {value!r}, not {wanted}")
+    return tuple(numbers.tolist()) if shape else float(numbers)
 
 
 def as_world(world: Any) -> World:

@@ -1,10 +1,12 @@
-"""A robot with two driven wheels: kinematics and encoder noise."""
+"""A robot with two driven wheels: kinematics, encoder noise and systematic errors."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxslam.core.calibration import Calibration
 from jaxslam.core.se2 import compose, dot, unit_vector
 from jaxslam.core.types import Array
 
@@ -16,10 +18,33 @@ class Robot(NamedTuple):
         wheel_base: [m] distance between the wheels.
         encoder_noise: [m / sqrt(m)] standard deviation of a wheel's encoder over one metre; its
             variance grows in proportion to the distance rolled.
+        wheel_scales: [-] true distance per distance that the encoder reads, left and right.
+        wheel_base_scale: [-] true distance between the wheels per `wheel_base`, which odometry
+            assumes.
+        mount: [m, m, rad] pose of the scanner in the frame of the robot.
+        time_offset: [s] by which the clock of the odometry is ahead: a scan with stamp t is taken
+            where the odometry has the robot at t + time_offset.
+        scan_period: [s] from a scan to the next. A robot that follows a path moves by 0.3 m and
+            turns by 0.2 rad in it, at most: by default at 0.6 m/s and 0.4 rad/s.
     """
 
     wheel_base: float = 0.4
     encoder_noise: float = 0.005
+    wheel_scales: tuple[float, float] = (1.0, 1.0)
+    wheel_base_scale: float = 1.0
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    time_offset: float = 0.0
+    scan_period: float = 0.5
+
+    def calibration(self) -> Calibration:
+        """The systematic errors, as `calibrate_odometry` removes them; NumPy arrays."""
+        left, right = self.wheel_scales
+        wheels = Calibration.of_wheels(
+            left, right, self.wheel_base_scale, wheel_base=self.wheel_base
+        )
+        mount, time_offset = np.asarray(self.mount), np.asarray(self.time_offset)
+        whole = wheels._replace(mount=mount, time_offset=time_offset)
+        return Calibration(*(np.asarray(x, float) for x in whole))
 
 
 def arc_increment(distance: Array, turn: Array) -> Array:
@@ -57,18 +82,26 @@ def wheel_std(distance: Array, noise: float) -> Array:
     return jnp.where(moves, noise * jnp.sqrt(jnp.abs(jnp.where(moves, distance, 1.0))), 0.0)
 
 
-def true_increment(robot: Robot, draws: Array, motion: Array) -> Array:
+def true_increment(robot: Robot, draws: Array, motion: Array, *, part: float = 1.0) -> Array:
     """True motion (3,) of a robot whose encoders read an arc, the motion (3,).
 
     Args:
-        robot: Wheel base and encoder noise.
+        robot: Its wheels and their noise.
         draws: (N, 2) standard normals, left and right; the arc is rolled in N equal parts.
         motion: (3,) what odometry reports [m, m, rad].
+        part: [-] of the time that the motion takes; its first part is returned.
     """
-    encoders = jnp.stack(wheel_distances(motion, robot.wheel_base))[None] / draws.shape[0]  # (1, 2)
+    steps = draws.shape[0]
+    encoders = jnp.stack(wheel_distances(motion, robot.wheel_base))[None] / steps  # (1, 2)
+    if robot.wheel_scales != (1.0, 1.0):
+        encoders = encoders * jnp.asarray(robot.wheel_scales, motion.dtype)[None]
     rolled = encoders + wheel_std(encoders, robot.encoder_noise) * draws  # (N, 2)
+    if part != 1.0:
+        share = np.clip(part * steps - np.arange(steps), 0.0, 1.0)
+        rolled = rolled * jnp.asarray(share, motion.dtype)[:, None]
+    base = robot.wheel_base * robot.wheel_base_scale
 
     def body(pose: Array, left_right: Array) -> tuple[Array, None]:
-        return compose(pose, wheel_increment(left_right[0], left_right[1], robot.wheel_base)), None
+        return compose(pose, wheel_increment(left_right[0], left_right[1], base)), None
 
     return jax.lax.scan(body, jnp.zeros_like(motion), rolled)[0]

@@ -99,7 +99,7 @@ class WeightedLoss(NamedTuple):
         return loss(info, episode)
 
 
-BY_NAME: Mapping[str, Loss] = MappingProxyType(
+BY_NAME: Mapping[str, Any] = MappingProxyType(  # of Loss, which mypy does not see in NamedTuples
     {
         "pose_nll": pose_nll,
         "pose_mse": pose_mse,
@@ -187,7 +187,8 @@ def check_loss(
     else:
         _check_episodes(loss, data, name)
     for term in compared:
-        term.check(model, data, name)
+        if model is not None:
+            term.check(model, data, name)
 
 
 def _check_episodes(loss: Loss, data: Episode, name: str) -> None:

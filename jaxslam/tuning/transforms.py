@@ -68,7 +68,15 @@ def _log(value: Any) -> Any:
     return value.__array_namespace__().log(value)
 
 
-def _is_positive(value: np.ndarray) -> bool:
+def _exp_scaled(theta: Any, scale: float) -> Any:
+    return theta.__array_namespace__().exp(scale * theta)
+
+
+def _log_scaled(value: Any, scale: float) -> Any:
+    return value.__array_namespace__().log(value) / scale
+
+
+def _is_positive(value: np.ndarray, *_: Any) -> bool:
     return bool(np.all(value > 0.0))
 
 
@@ -139,6 +147,17 @@ def real(scale: float | tuple[float, ...]) -> Transform:
     return REAL._replace(constants=(scale if np.ndim(scale) == 0 else tuple(scales.tolist()),))
 
 
+def positive(scale: float) -> Transform:
+    """Numbers above 0, by their logarithm in units of `scale`: a relative change that matters.
+
+    Raises:
+        ValueError: The scale is not positive and finite.
+    """
+    if not 0.0 < scale < math.inf:
+        raise ValueError(f"scale is {scale!r}, not positive and finite")
+    return Transform(_exp_scaled, _log_scaled, _is_positive, "positive", (scale,))
+
+
 def bounded(low: float, high: float) -> Transform:
     """Numbers between two bounds, by their logit.
 
@@ -151,7 +170,9 @@ def bounded(low: float, high: float) -> Transform:
     return Transform(_bounded_forward, _bounded_inverse, _is_between, text, (low, high))
 
 
-CALIBRATION = Calibration._make([POSITIVE, POSITIVE, real(0.05), real((0.2, 0.2, 0.1)), real(0.1)])
+CALIBRATION = Calibration._make(
+    [positive(0.05), positive(0.05), real(0.1), real((0.1, 0.1, 0.05)), real(0.1)]
+)
 """Transforms of a `Calibration`; the scales are [rad / m], [m, m, rad] and [s]."""
 
 BY_FIELD: Mapping[str, Transform] = MappingProxyType(

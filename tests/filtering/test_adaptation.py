@@ -79,6 +79,7 @@ def test_the_step_is_the_derivative_of_the_likelihood():
     v = innovations(jax.random.key(1), 1)[0]
     at = jnp.array([0.3, 0.2])
 
+    @jax.jit
     def log_density(theta):
         cov, _, rows = scaled(theta)
         s = innovation_cov(cov, rows)[:5, :5]
@@ -88,7 +89,7 @@ def test_the_step_is_the_derivative_of_the_likelihood():
     cov, own_q, rows = scaled(at)
     rows = rows._replace(residual=v)
     start = Adaptation(at, 50.0 * jnp.eye(2))
-    end = adapt(SPEC, start, cov, rows, SIZE, own_q)
+    end = jax.jit(partial(adapt, SPEC))(start, cov, rows, SIZE, own_q)
     metric = end.information + jnp.eye(2) / SPEC.prior_std**2
     step = metric @ (end.log_variance - at)
     np.testing.assert_allclose(step, jax.grad(log_density)(at), rtol=1e-9)

@@ -122,6 +122,7 @@ def test_a_factor_does_not_overflow():
 def test_derivatives_are_those_of_differences():
     given = measurement()
 
+    @jax.jit
     def value(r_weights, q_weights):
         params = PARAMS._replace(
             measurement_weights=MeasurementWeights(*r_weights),

@@ -113,6 +113,7 @@ def test_an_uncertain_robot_does_not_follow_a_wrong_landmark():
 def test_derivatives_are_those_of_differences():
     cov, rows = problem()
 
+    @jax.jit
     def value(nu, R, residual):
         own = rows._replace(R=R, residual=residual)
         found, score = robust.reweight(nu, cov, own, SIZE)
@@ -128,6 +129,7 @@ def test_a_matrix_that_is_not_definite_scores_nothing():
     assert score.log_likelihood == 0.0 and score.nis == 0.0
 
 
+@pytest.mark.slow
 def test_an_outlier_moves_the_robust_filter_less():
     several = landmark_drives.drives(jax.random.key(0), count=1, steps=12)[1]
     measurements = jax.tree.map(lambda x: x[0], several)

@@ -10,7 +10,7 @@ from jaxslam.simulation import robot
 from jaxslam.simulation.robot import Robot
 
 ROBOT = Robot()
-COEFFICIENTS = wheel_coefficients(*ROBOT)
+COEFFICIENTS = wheel_coefficients(*ROBOT[:2])
 DRAWS = 20_000
 STANDARD_ERRORS = 5
 

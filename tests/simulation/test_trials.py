@@ -36,7 +36,7 @@ PATH = path_following.densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6
 
 SETTING = (
     CONFIG,
-    NoiseParams.for_simulated_robot(*ROBOT),
+    NoiseParams.for_simulated_robot(*ROBOT[:2]),
     ROBOT,
     World(jnp.asarray(worlds.named("fig07").walls)),
     jnp.asarray(PATH),

@@ -91,7 +91,7 @@ def prepare(
     if not isinstance(stacked, Episode):  # the filter's functions fit, and take long to trace
         check_model(model, arrays, jax.tree.map(lambda x: x[0], stacked))
     function = default_loss(stacked) if loss is None else resolve(loss)
-    check_loss(function, stacked, name=name, model=model)
+    check_loss(function, stacked, name=name)
     return Problem(model_for(function, model), function, used, arrays, stacked)
 
 

@@ -157,16 +157,13 @@ def needs_truth(loss: Loss) -> bool:
     return loss in (pose_mse, pose_nll)
 
 
-def check_loss(
-    loss: Loss, data: Any, *, name: str = "episodes", model: Model | None = None
-) -> None:
+def check_loss(loss: Loss, data: Any, *, name: str = "episodes") -> None:
     """Check, before any work starts, that a loss can be evaluated on data [B].
 
     Args:
         loss: The loss.
         data: [B] sequences; episodes as `inputs.as_episodes` returns them.
         name: What they are called in the error message.
-        model: The model that is tuned, if it is known.
 
     Raises:
         ValueError: The loss is no function, or a sum without terms; there are no episodes, or
@@ -187,8 +184,7 @@ def check_loss(
     else:
         _check_episodes(loss, data, name)
     for term in compared:
-        if model is not None:
-            term.check(model, data, name)
+        term.check(data, name)
 
 
 def _check_episodes(loss: Loss, data: Episode, name: str) -> None:

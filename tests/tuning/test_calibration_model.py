@@ -1,11 +1,9 @@
 """The calibration as a model to tune: the same estimate as by Gauss-Newton steps."""
 
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
 import pytest
+import wheel_drives
 
 from jaxslam.smoothing.odometry_calibration import (
     estimate_calibration,
@@ -16,9 +14,6 @@ from jaxslam.smoothing.odometry_calibration import (
 from jaxslam.tuning import calibration_model
 from jaxslam.tuning.calibration_model import CALIBRATION_MODEL, CalibrationParams
 from jaxslam.tuning.model import run_model
-
-sys.path.append(str(Path(__file__).parents[1] / "smoothing"))
-import wheel_drives  # noqa: E402
 
 
 def test_pieces_hold_all_spans_once():

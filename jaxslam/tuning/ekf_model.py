@@ -277,9 +277,7 @@ def _wrap(x: Array, angles: tuple[int, ...]) -> Array:
     return jnp.where(chosen, wrap_angle(x), x)
 
 
-def _check(
-    functions: _Functions, params: Any, data: Any, name: str
-) -> tuple[Any, EkfSequence]:
+def _check(functions: _Functions, params: Any, data: Any, name: str) -> tuple[Any, EkfSequence]:
     """Parameters and data [B] as arrays; ValueError if they do not fit the functions."""
     check_type(name, data, EkfSequence)
     params, data = as_arrays(params, data, name)

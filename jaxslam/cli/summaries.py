@@ -20,6 +20,7 @@ SUMMARY_ROWS = (
     ("rotation_mean_deg", "relation error, rotation", "deg"),
 )
 MAX_WARNINGS = 5  # that are printed
+MAX_VERDICTS = 3
 
 
 def print_summary(numbers: Metrics, title: str, out: Path) -> None:
@@ -143,8 +144,12 @@ def print_tuning_summary(numbers: Metrics, title: str, out: Path) -> None:
     _print_params(before["noise"], numbers["noise"], numbers["standard_errors"] or {})
     for warning in numbers["warnings"]:
         print(f"warning: {warning}")
+    consistency = numbers["consistency"]["after"]
+    if consistency is not None:
+        for verdict in consistency["verdicts"][:MAX_VERDICTS]:
+            print(f"filter: {verdict}")
     _print_seconds(numbers)
-    print(f"results: {out}{os.sep}noise.json, metrics.json, history.png")
+    print(f"results: {out}{os.sep}noise.json, metrics.json, report.png, history.png")
 
 
 def _print_params(

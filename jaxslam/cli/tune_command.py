@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import summaries
+from jaxslam.cli import summaries, tune_report
 from jaxslam.cli.log_options import Scanner, ScannerOptions
 from jaxslam.cli.options import (
     Files,
@@ -27,12 +27,16 @@ from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.episode import Episode
 from jaxslam.core.types import Metrics
-from jaxslam.evaluation import summary
+from jaxslam.evaluation import (
+    ConsistencyReport,
+    filter_with_statistics,
+    slam_consistency,
+    summary,
+)
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import checkpoint, noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
-from jaxslam.pipeline import episodes
 from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors, tune_state
 from jaxslam.tuning.losses import Loss
 from jaxslam.tuning.tune_state import TuneResult, TuneState
@@ -77,7 +81,8 @@ def tune(
     """Tune the noise parameters of the filter (Q and R) on logs or on simulated trials.
 
     Writes noise.json, which --noise of the other commands reads; metrics.json with the errors
-    before and after, and the standard errors of the parameters; and history.png. When interrupted,
+    before and after, the standard errors of the parameters, and tests of the filter's consistency;
+    history.png; and report.png, all of it on one page, with findings in words. When interrupted,
     noise.json holds the best parameters so far, and the same command resumes the tuning.
 
     The parameters are the four coefficients of the odometry noise (Q); standard deviations of range
@@ -147,11 +152,12 @@ def tune(
             job = task.load()
             found = _tune(job, out, settings)
             with _resumable(out, lambda: "all evaluations"):
-                numbers = _evaluate(job, found, settings)
+                numbers, report = _evaluate(job, found, settings)
         numbers |= {"seconds": seconds}
         noise_file.write(out_dir / PARAMS_FILE, found.params)
         write_json(out_dir / "metrics.json", numbers)
         _draw_history(out_dir / "history.png", found)
+        tune_report.draw_report(out_dir / "report.png", job.title, numbers, found, report)
     (out / CHECKPOINT_FILE).unlink(missing_ok=True)
     summaries.print_tuning_summary(numbers, job.title, out)
 
@@ -227,22 +233,26 @@ def _resumable(out: Path, done: Callable[[], str | int]) -> Iterator[None]:
         ) from None
 
 
-def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
-    """Errors before and after the tuning, and standard errors of the parameters."""
+def _evaluate(
+    job: TuneJob, found: TuneResult, settings: _Settings
+) -> tuple[Metrics, tune_report.TuneReport]:
+    """Errors and consistency before and after the tuning, standard errors of the parameters."""
     evaluated = job.train if job.test is None else job.test
 
-    def errors(params: NoiseParams) -> Metrics:
+    def errors(params: NoiseParams) -> tuple[Metrics, ConsistencyReport | None]:
         loss = fitting.values(job.config, params, evaluated, settings.loss)
         numbers: Metrics = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
+        results, statistics = filter_with_statistics(job.config, params, evaluated)
         if evaluated.truth_mask is None or evaluated.truth_mask.any():
-            results = episodes.filter_episodes(job.config, params, evaluated)
             numbers |= summary.evaluate(results)
-        return numbers
+        return numbers, slam_consistency(results, statistics)
 
     print("evaluating errors before and after, and standard errors ...", flush=True)
-    numbers = errors(found.params) | {
+    numbers, after = errors(found.params)
+    numbers_before, before = errors(job.params)
+    numbers |= {
         "judged_on": "the runs it was tuned on" if job.test is None else "held-out runs",
-        "before": errors(job.params) | {"noise": noise_file.to_keys(job.params)},
+        "before": numbers_before | {"noise": noise_file.to_keys(job.params)},
         "evaluations": len(found.loss),
         "best": found.best,
         "skipped": int(found.skipped.sum()),
@@ -250,6 +260,7 @@ def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
         "standard_errors": None,
         "warnings": ["no standard errors: they need two episodes at least"],
     }
+    sure = None
     if len(job.train.odometry) >= 2:
         sure = standard_errors.standard_errors(
             job.config, found.params, job.train, loss=settings.loss, frozen=settings.frozen
@@ -257,7 +268,17 @@ def _evaluate(job: TuneJob, found: TuneResult, settings: _Settings) -> Metrics:
         keys = map(noise_file.key_of, sure.names)
         numbers["standard_errors"] = dict(zip(keys, sure.relative.tolist(), strict=True))
         numbers["warnings"] = list(sure.warnings)
-    return numbers
+    names, values = tune_report.numbers_of(found.params)
+    report = tune_report.TuneReport(
+        before=before,
+        after=after,
+        names=names,
+        start=tune_report.numbers_of(job.params)[1],
+        found=values,
+        frozen=~parameters.trainable_mask(found.params, settings.frozen),
+        errors=sure,
+    )
+    return numbers | tune_report.report_blocks(report), report
 
 
 def _hash(episodes: Episode | None) -> str:

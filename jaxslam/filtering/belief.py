@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jaxslam.core.arguments import as_float, check_covariance
 from jaxslam.core.features import Features
 from jaxslam.core.types import CORNER, JUNCTION, Array
+from jaxslam.filtering.adaptation import Adaptation
 from jaxslam.filtering.covariance import DeferredCovariance, flush
+from jaxslam.filtering.odometry_bias import OdometryBias
 
 
 class Belief(NamedTuple):
@@ -39,6 +41,8 @@ class Belief(NamedTuple):
             corner.
         step: () int32 number of the step.
         next_id: () int32 ID of the next landmark.
+        bias: Biases of odometry as states; None: it has none (`odometry_bias`).
+        adaptation: Scales of Q and R that adapt; None: they stay (`adaptation`).
     """
 
     mean: Array
@@ -56,6 +60,8 @@ class Belief(NamedTuple):
     descriptor: Array
     step: Array
     next_id: Array
+    bias: OdometryBias | None = None
+    adaptation: Adaptation | None = None
 
     @property
     def pose(self) -> Array:
@@ -127,6 +133,10 @@ def grow_belief(belief: Belief, max_landmarks: int) -> Belief:
         size = belief.num_seen.size
         raise ValueError(f"max_landmarks is {max_landmarks}, less than the {size} slots there are")
     blank = initial_belief(belief.pose, max_landmarks=max_landmarks)
+    bias = belief.bias
+    if bias is not None:
+        bias = bias._replace(map_cov=jnp.zeros((len(bias.cov), 2 * max_landmarks), bias.cov.dtype))
+    blank = blank._replace(bias=bias, adaptation=belief.adaptation)
 
     def put_at_start(old: Array, new: Array) -> Array:
         return new.at[tuple(slice(n) for n in old.shape)].set(old)

@@ -8,9 +8,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxslam.core.types import CORNER, JUNCTION, WALL, Array
+from jaxslam.filtering.adaptation import AdaptationSpec, check_adaptation, initial_adaptation
 from jaxslam.filtering.belief import Belief, initial_belief
 from jaxslam.filtering.data_association import AssociationSpec
 from jaxslam.filtering.ekf import check_linearisation
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.noise_model import NoiseModel
+from jaxslam.filtering.odometry_bias import NUM_BIASES, initial_bias
 
 KIND_NAMES = {JUNCTION: "JUNCTION", CORNER: "CORNER", WALL: "WALL"}
 FULL_TURN = 2 * math.pi + 0.1  # [rad] widest field of view, with an allowance for rounding
@@ -57,6 +61,11 @@ class FilterConfig(NamedTuple):
         max_misses: Number of consecutive missed detections after which a junction is pruned.
         field_of_view: [rad] directions of the scanner's first and last beam: outside, a detection
             cannot be missed. `Config.for_lidar` sets it.
+        noise_model: Functions of one's own for Q and R, with `NoiseParams.custom`; None: none.
+        odometry_bias_std: [-, -, rad / m] standard deviations of the biases of odometry at the
+            start: distance per distance, rotation per rotation, rotation per distance; they are
+            states then (`odometry_bias`). 0 fixes one; None: there are none.
+        adaptation: How Q and R are scaled while the robot goes; None: they stay.
     """
 
     landmark_kinds: tuple[int, ...] = (JUNCTION, CORNER, WALL)
@@ -72,6 +81,9 @@ class FilterConfig(NamedTuple):
     evict_after: int = 5
     max_misses: int = 10
     field_of_view: tuple[float, float] = (-math.pi / 2, math.pi / 2)
+    noise_model: NoiseModel | None = None
+    odometry_bias_std: tuple[float, ...] | None = None
+    adaptation: AdaptationSpec | None = None
 
 
 def check_config(config: FilterConfig) -> None:
@@ -114,6 +126,21 @@ def _check_fields(config: FilterConfig, _: tuple[type, ...]) -> None:
             _check_number(f"association.{name}", value, 1, whole=True)
         else:
             _check_number(f"association.{name}", value, 0, above=name not in MAY_BE_ZERO)
+    model = config.noise_model
+    if model is not None:
+        is_model = isinstance(model, NoiseModel)
+        if not is_model or not all(x is None or callable(x) for x in model):
+            raise ValueError(f"config.noise_model is {model!r}, not a NoiseModel of functions")
+    std = config.odometry_bias_std
+    if std is not None and not (
+        isinstance(std, tuple)
+        and len(std) == NUM_BIASES
+        and all(isinstance(x, Real) and 0.0 <= x < math.inf for x in std)
+    ):
+        wanted = f"a tuple of {NUM_BIASES} finite standard deviations, 0 or more"
+        raise ValueError(f"config.odometry_bias_std is {std!r}, not {wanted}")
+    if config.adaptation is not None:
+        check_adaptation("config.adaptation", config.adaptation)
     view = config.field_of_view
     numbers = isinstance(view, tuple) and len(view) == 2 and all(isinstance(x, Real) for x in view)
     if not numbers or not 0.0 < view[1] - view[0] <= FULL_TURN:
@@ -147,7 +174,61 @@ def init(config: FilterConfig, pose: Array, cov: Array | None = None) -> Belief:
             or holds no numbers, or `cov` is not symmetric and positive semi-definite.
     """
     check_config(config)
-    return initial_belief(pose, max_landmarks=config.max_landmarks, cov=cov)
+    belief = initial_belief(pose, max_landmarks=config.max_landmarks, cov=cov)
+    return with_options(config, belief)
+
+
+def with_options(config: FilterConfig, belief: Belief) -> Belief:
+    """The belief with biases of odometry and scales of the noise, where the configuration has them.
+
+    Those that it has already stay. They begin anew where a belief, as of a saved map, has none.
+    """
+    size, dtype = belief.num_seen.size, belief.mean.dtype
+    if config.odometry_bias_std is None:
+        belief = belief._replace(bias=None)
+    elif belief.bias is None:
+        belief = belief._replace(bias=initial_bias(config.odometry_bias_std, size, dtype))
+    if config.adaptation is None:
+        belief = belief._replace(adaptation=None)
+    elif belief.adaptation is None:
+        belief = belief._replace(adaptation=initial_adaptation(dtype))
+    return belief
+
+
+def check_options(config: FilterConfig, params: NoiseParams, belief: Belief | None = None) -> None:
+    """Check that parameters and belief have what the options of the configuration need.
+
+    Args:
+        config: Static configuration of the filter.
+        params: Noise parameters.
+        belief: Belief, if there is one already.
+
+    Raises:
+        ValueError: One has something that the configuration does not use, or lacks something.
+    """
+    if belief is not None:
+        _check_belief(config, belief)
+    if params.odometry_bias_walk is not None and config.odometry_bias_std is None:
+        raise ValueError(
+            "params.odometry_bias_walk is given, but config.odometry_bias_std is None: there are "
+            "no biases"
+        )
+    if params.custom is not None and config.noise_model is None:
+        raise ValueError(
+            "params.custom is given, but config.noise_model is None: nothing would use it"
+        )
+
+
+def _check_belief(config: FilterConfig, belief: Belief) -> None:
+    """Raise ValueError unless a belief has what the options of the configuration need, no more."""
+    for option, field in (("odometry_bias_std", "bias"), ("adaptation", "adaptation")):
+        wanted, given = getattr(config, option) is not None, getattr(belief, field) is not None
+        if wanted != given:
+            of_config, of_belief = ("is given", "is None") if wanted else ("is None", "is given")
+            raise ValueError(
+                f"config.{option} {of_config}, but belief.{field} {of_belief}; make the belief by "
+                "init(config, pose), or with_options(config, belief)"
+            )
 
 
 def required_observations(config: FilterConfig, kind: Array) -> Array:

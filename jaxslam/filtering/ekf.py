@@ -35,12 +35,40 @@ def check_linearisation(name: str) -> None:
 
 
 def covariance_blocks(belief: Belief) -> CovarianceBlocks:
-    """Covariance of the belief in blocks, as `kalman_update` takes it."""
-    return CovarianceBlocks(belief.pose_cov, belief.cross_cov, belief.map_cov)
+    """Covariance of the belief in blocks, as `kalman_update` takes it.
+
+    Biases of odometry follow the pose in its block.
+    """
+    if belief.bias is None:
+        return CovarianceBlocks(belief.pose_cov, belief.cross_cov, belief.map_cov)
+    bias = belief.bias
+    upper = jnp.concatenate([belief.pose_cov, bias.pose_cov.T], axis=1)
+    lower = jnp.concatenate([bias.pose_cov, bias.cov], axis=1)
+    return CovarianceBlocks(
+        pose=jnp.concatenate([upper, lower]),
+        cross=jnp.concatenate([belief.cross_cov, bias.map_cov]),
+        map=belief.map_cov,
+    )
 
 
-def with_gaussian(belief: Belief, mean: Array, cov: CovarianceBlocks) -> Belief:
-    """The belief with another mean (D,), whose heading is wrapped, and another covariance."""
+def with_gaussian(belief: Belief, shift: Array, cov: CovarianceBlocks) -> Belief:
+    """The belief with its mean shifted, the heading wrapped, and another covariance.
+
+    Args:
+        belief: The belief.
+        shift: (D,) change of the mean; with biases (3 + 3 + 2 L,), those after the pose.
+        cov: In the blocks of `covariance_blocks`.
+    """
+    if belief.bias is not None:
+        bias = belief.bias._replace(
+            mean=belief.bias.mean + shift[3:6],
+            cov=cov.pose[3:, 3:],
+            pose_cov=cov.pose[3:, :3],
+            map_cov=cov.cross[3:],
+        )
+        belief, shift = belief._replace(bias=bias), jnp.concatenate([shift[:3], shift[6:]])
+        cov = CovarianceBlocks(cov.pose[:3, :3], cov.cross[:3], cov.map)
+    mean = belief.mean + shift
     return belief._replace(
         mean=mean.at[2].set(wrap_angle(mean[2])),
         pose_cov=cov.pose,
@@ -50,7 +78,12 @@ def with_gaussian(belief: Belief, mean: Array, cov: CovarianceBlocks) -> Belief:
 
 
 def predict(
-    belief: Belief, odometry: Array, odometry_cov: Array, *, linearisation: str = "standard"
+    belief: Belief,
+    odometry: Array,
+    odometry_cov: Array,
+    *,
+    linearisation: str = "standard",
+    by_bias: Array | None = None,
 ) -> Belief:
     """Move the belief by odometry; landmarks stay.
 
@@ -71,6 +104,8 @@ def predict(
         odometry: (3,) odometry increment [m, m, rad], frame of the pose before it.
         odometry_cov: (3, 3) its covariance Q in the same frame.
         linearisation: One of `LINEARISATIONS`.
+        by_bias: (3, 3) derivative of the increment by the biases of odometry, where the belief has
+            some; `odometry_bias` has the equations.
 
     Raises:
         ValueError: The linearisation is none of them; while tracing.
@@ -87,11 +122,33 @@ def predict(
     to_map_frame = jnp.eye(3, dtype=odometry_cov.dtype).at[:2, :2].set(rotation(pose[2]))  # G
     pose_cov = belief.pose_cov.at[:2].add(by_heading[:, None] * belief.pose_cov[2:])
     pose_cov = pose_cov.at[:, :2].add(pose_cov[:, 2:] * by_heading[None])
-    return belief._replace(
+    moved = belief._replace(
         mean=belief.mean.at[:3].set(predicted),
         first_estimate=belief.first_estimate.at[:3].set(predicted),
         pose_cov=pose_cov + to_map_frame @ odometry_cov @ to_map_frame.T,
         cross_cov=belief.cross_cov.at[:2].add(by_heading[:, None] * belief.cross_cov[2:]),
+    )
+    if by_bias is None:
+        return moved
+    return _add_bias_errors(moved, by_heading, to_map_frame @ by_bias)
+
+
+def _add_bias_errors(belief: Belief, by_heading: Array, by_bias: Array) -> Belief:
+    """Covariances of the predicted pose that come from the biases of odometry.
+
+    Args:
+        belief: Predicted without them.
+        by_heading: (2,) derivative of x, y by the heading, of F.
+        by_bias: (3, 3) J, derivative of the predicted pose by the biases.
+    """
+    bias = belief.bias
+    assert bias is not None
+    with_pose = bias.pose_cov.at[:, :2].add(bias.pose_cov[:, 2:] * by_heading[None])  # P_bp F^T
+    mixed = by_bias @ with_pose
+    return belief._replace(
+        pose_cov=belief.pose_cov + mixed + mixed.T + by_bias @ bias.cov @ by_bias.T,
+        cross_cov=belief.cross_cov + by_bias @ bias.map_cov,
+        bias=bias._replace(pose_cov=with_pose + bias.cov @ by_bias.T),
     )
 
 
@@ -127,6 +184,8 @@ def linearize(
     if linearisation == "first_estimates":
         first_positions = belief.first_estimate[3:].reshape(-1, 2)
         _, H_pose, H_landmark = predict_all(belief.pose, first_positions[safe_slot], kind)
+    if belief.bias is not None:  # measured through the pose alone
+        H_pose = jnp.pad(H_pose, ((0, 0), (0, 0), (0, len(belief.bias.mean))))
     keep = matched[:, None]
     eye = jnp.eye(2, dtype=R.dtype)
     return LinearizedMeasurements(
@@ -164,7 +223,7 @@ def update(
     shift, cov = result.shift, result.cov
     if linearisation == "invariant":
         shift, cov = _retract_invariant(shift, cov, belief.kind == WALL)
-    return with_gaussian(belief, belief.mean + shift, cov), result
+    return with_gaussian(belief, shift, cov), result
 
 
 def _retract_invariant(
@@ -204,10 +263,14 @@ def _retract_invariant(
     """
     theta = shift[2]
     left_jacobian = jnp.sinc(theta / (2 * jnp.pi)) * rotation(theta / 2)
-    slot_shift = shift[3:].reshape(-1, 2)
+    width = len(cov.pose)
+    slot_shift = shift[width:].reshape(-1, 2)
     slot_shift = jnp.where(is_wall[:, None], slot_shift, slot_shift @ left_jacobian.T)
     pose_shift = jnp.concatenate([left_jacobian @ shift[:2], theta[None]])
     lever_pose = jnp.stack([-pose_shift[1], pose_shift[0], jnp.zeros_like(theta)])
+    if width > 3:  # biases of odometry stay as they are
+        pose_shift = jnp.concatenate([pose_shift, shift[3:width]])
+        lever_pose = jnp.pad(lever_pose, (0, width - 3))
     lever_map = jnp.stack([-slot_shift[:, 1], slot_shift[:, 0]], axis=-1)
     lever_map = jnp.where(is_wall[:, None], 0.0, lever_map).reshape(-1)
     heading_variance = cov.pose[2, 2]

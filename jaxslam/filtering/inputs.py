@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.arguments import as_float
+from jaxslam.core.arguments import as_float, check_covariance
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement, ScanMatch
 from jaxslam.core.types import Array, check_array, check_type
 from jaxslam.filtering.belief import Belief
+from jaxslam.filtering.heteroscedastic import WEIGHTS
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.odometry_bias import NUM_BIASES
 
 # Fields of `Features` that hold floats, with their trailing sizes.
 FLOATS: dict[str, tuple[int, ...]] = {
@@ -33,7 +35,14 @@ OTHERS = {
     "trusted": (jnp.bool_, jnp.bool_),
     "valid": (jnp.bool_, jnp.bool_),
 }
-MAY_BE_ZERO = ("odometry_coefficients",)  # no error that grows with distance, or with rotation
+MAY_BE_ZERO = ("odometry_coefficients", "odometry_bias_walk")  # what does not grow
+OPTIONAL = tuple(NoiseParams._field_defaults)  # fields of the noise that may be None
+SHAPES: dict[str, tuple[int, ...]] = {
+    "odometry_coefficients": (4,),
+    "odometry_cov_rate": (3, 3),
+    "odometry_bias_walk": (NUM_BIASES,),
+}
+"""Shapes of the fields of `NoiseParams` that are no single number."""
 
 
 def check_inputs(
@@ -87,24 +96,65 @@ def check_params(
 
     Raises:
         ValueError: A shape is wrong, or a value is concrete and not positive and finite; those of
-            `odometry_coefficients` may be 0.
+            `odometry_coefficients` may be 0, `odometry_cov_rate` is positive semi-definite, and
+            weights are only finite.
     """
     check_type("params", params, NoiseParams)
 
-    def convert(field: str, value: Any) -> Array | None:
-        if value is None and field == "scan_match_std_scale":
+    def convert(field: str, value: Any) -> Any:
+        if value is None and field in OPTIONAL:
             return None
         name = f"params.{field}"
-        array = _floats(name, value, (4,) if field == "odometry_coefficients" else (), dtype)
-        numbers = concrete_values(array)
-        if check_values and numbers is not None:
-            in_range = numbers >= 0.0 if field in MAY_BE_ZERO else numbers > 0.0
-            if not np.all(in_range & np.isfinite(numbers)):
-                wanted = "non-negative" if field in MAY_BE_ZERO else "positive"
-                raise ValueError(f"{name} is {numbers.tolist()}, not {wanted} and finite")
+        if field == "custom":
+            return as_tree(name, value, dtype, check_values=check_values)
+        if field in WEIGHTS:
+            return _as_weights(name, value, WEIGHTS[field], dtype, check_values=check_values)
+        array = _floats(name, value, SHAPES.get(field, ()), dtype)
+        if check_values:
+            _check_values(name, field, array)
         return array
 
     return NoiseParams._make(convert(field, value) for field, value in params._asdict().items())
+
+
+def _as_weights(name: str, weights: Any, kind: Any, dtype: Any, *, check_values: bool) -> Any:
+    """A record of weights, each (3,) or None, as JAX arrays; checked, finite where concrete."""
+    check_type(name, weights, kind)
+    given = {field: x for field, x in weights._asdict().items() if x is not None}
+    arrays = {field: _floats(f"{name}.{field}", x, (3,), dtype) for field, x in given.items()}
+    for field, array in arrays.items():
+        numbers = concrete_values(array)
+        if check_values and numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"{name}.{field} is {numbers.tolist()}, not finite")
+    return kind(**arrays)
+
+
+def as_tree(name: str, tree: Any, dtype: Any, *, check_values: bool) -> Any:
+    """A tree of arrays of any shapes as JAX arrays of floats; checked, finite where concrete."""
+
+    def convert(path: Any, x: Any) -> Array:
+        own = name + jax.tree_util.keystr(path)
+        array = as_float(own, x, (...,)).astype(dtype)
+        numbers = concrete_values(array)
+        if check_values and numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"{own} holds numbers that are not finite")
+        return array
+
+    return jax.tree_util.tree_map_with_path(convert, tree)
+
+
+def _check_values(name: str, field: str, array: Array) -> None:
+    """Raise ValueError if the values of a field of the noise are concrete and out of range."""
+    numbers = concrete_values(array)
+    if numbers is None:
+        return
+    if field == "odometry_cov_rate":
+        check_covariance(name, array, definite=False)
+        return
+    in_range = numbers >= 0.0 if field in MAY_BE_ZERO else numbers > 0.0
+    if not np.all(in_range & np.isfinite(numbers)):
+        wanted = "non-negative" if field in MAY_BE_ZERO else "positive"
+        raise ValueError(f"{name} is {numbers.tolist()}, not {wanted} and finite")
 
 
 def concrete_values(x: Array) -> np.ndarray | None:

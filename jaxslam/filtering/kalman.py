@@ -1,7 +1,8 @@
 """Kalman update of a Gaussian over pose and map by measurements of one landmark each.
 
 The covariance is kept in blocks, of the pose (3, 3), of pose and map (3, 2 L), and of the map
-(2 L, 2 L): a prediction leaves the largest of them alone, and its rows stay aligned in memory.
+(2 L, 2 L): a prediction leaves the largest of them alone, and its rows stay aligned in memory. With
+biases of odometry beside the pose, the 3 in all shapes is 6.
 
 The derivative of the update is written by hand (`_bwd`), with its derivation.
 """
@@ -90,9 +91,7 @@ def kalman_update(cov: CovarianceBlocks, rows: LinearizedMeasurements) -> Update
     is not finite, nothing is changed.
 
     Cost: O(N (2 L)^2) for P', N = 2 M, O(N^2 L) for the rest. H is never built: a measurement has
-    five columns that are not zero.
-
-    Derivatives are taken in reverse only, by `_bwd`. They take `cov` to be symmetric.
+    five columns that are not zero. Derivatives, in reverse only, are by `_bwd`; `cov` is symmetric.
 
     References:
         Paper, eqs. (14)-(16).
@@ -117,12 +116,14 @@ def _project(cov: CovarianceBlocks, rows: LinearizedMeasurements) -> tuple[_Colu
     cov_slot_pose = jnp.moveaxis(_slot_columns(cov.cross, slot), 0, 2)  # (M, 2, 3)
     cov_slot_map = slot_rows(cov.map, slot)  # (M, 2, 2 L)
     hp_pose = _small_matmul(rows.H_pose, cov.pose[None])
-    hp_pose = (hp_pose + _small_matmul(rows.H_landmark, cov_slot_pose)).reshape(n, 3)
+    hp_pose = (hp_pose + _small_matmul(rows.H_landmark, cov_slot_pose)).reshape(n, -1)
     hp_map = _small_matmul(rows.H_pose, cov.cross[None])
     hp_map = (hp_map + _small_matmul(rows.H_landmark, cov_slot_map)).reshape(n, -1)
     # H P H^T: columns of the pose, then those of each measurement's landmark.
     hp_slot = _slot_columns(hp_map, slot)  # (N, M, 2)
-    s = _sum(hp_pose[:, None, None, k] * rows.H_pose[None, ..., k] for k in range(3))
+    s = _sum(
+        hp_pose[:, None, None, k] * rows.H_pose[None, ..., k] for k in range(rows.H_pose.shape[-1])
+    )
     s += _sum(hp_slot[:, :, None, k] * rows.H_landmark[None, ..., k] for k in range(2))
     eye = jnp.eye(slot.size, dtype=s.dtype)[:, None, :, None]
     s = s.reshape(-1, 2, n // 2, 2) + eye * rows.R[:, :, None]
@@ -203,8 +204,7 @@ def _bwd(saved: _Saved, grad: UpdateResult) -> tuple[CovarianceBlocks, Linearize
         d nis    = 2 u^T dv - u^T H dP H^T u - 2 u^T dH shift - u^T dR u
         d logdet = tr(S^-1 H dP H^T) + 2 tr(K dH) + tr(S^-1 dR)
 
-    (dP' is the differential of Joseph's form J P J^T + K R K^T; dK drops out of it, as K is its
-    minimum.)
+    (dP' is that of Joseph's form J P J^T + K R K^T; dK drops out of it, as K is its minimum.)
 
     Step 2, collect. The loss changes by tr(G dP') + g^T d shift + n d nis + l d logdet. With the
     products Q = K^T G (N, D) and r = K^T g (N,), the factors of dv, dR, dH are
@@ -225,8 +225,7 @@ def _bwd(saved: _Saved, grad: UpdateResult) -> tuple[CovarianceBlocks, Linearize
     The symbols are the names in the code: `gain` is K^T (N, D), A is `inv_root`, and as
     S^-1 = A^T A and K^T = A^T Y, all products start from A, Y and w = A v.
 
-    Cost: two products of Y with a matrix (2 L, 2 L), in `_factors`, where the update has one; the
-    rest is O(N^2 L).
+    Cost: two products of Y with a matrix (2 L, 2 L), in `_factors`; the rest is O(N^2 L).
     """
     rows, m = saved.rows, saved.rows.slot.size
     if isinstance(grad.cov.map, DeferredCovariance):
@@ -234,7 +233,8 @@ def _bwd(saved: _Saved, grad: UpdateResult) -> tuple[CovarianceBlocks, Linearize
     # Half of the stored block belongs to pose and map, half to map and pose.
     grad_pose = (grad.cov.pose + grad.cov.pose.T) / 2
     G = _CovarianceGradient(grad_pose, grad.cov.cross / 2, grad.cov.map)
-    g = _Columns(grad.shift[:3], grad.shift[3:])
+    width = rows.H_pose.shape[-1]
+    g = _Columns(grad.shift[:width], grad.shift[width:])
     factors = _factors(saved, G, g)
     grad_v = factors.r + 2 * grad.nis * factors.u
     grad_R = _grad_R(saved.inv_root, factors, grad.nis, grad.logdet)
@@ -287,7 +287,7 @@ def _grad_P(
     """
     _, Q, u, _ = factors
     m, n, slot = rows.slot.size, 2 * rows.slot.size, rows.slot
-    size = G.map.shape[1] // 2
+    size, width = G.map.shape[1] // 2, rows.H_pose.shape[-1]
 
     # X (N, D). The last term's columns are those of the pose, and of the measured slots.
     grad_R_by_row = grad_R.reshape(n, m, 2)
@@ -298,10 +298,11 @@ def _grad_P(
     x_map = x_map.reshape(n, size, 2).at[:, slot].add(x_slot).reshape(n, -1)
 
     # H^T X: rows of the pose, and of the measured slots.
-    h_pose = rows.H_pose.reshape(n, 3)
-    slot_pose = _slot_rows(rows.H_landmark, x_pose.reshape(m, 2, 3))
+    h_pose = rows.H_pose.reshape(n, width)
+    slot_pose = _slot_rows(rows.H_landmark, x_pose.reshape(m, 2, width))
     slot_map = _slot_rows(rows.H_landmark, x_map.reshape(m, 2, -1))
-    map_pose = jnp.zeros((size, 2, 3), x_pose.dtype).at[slot].add(slot_pose).reshape(-1, 3)
+    map_pose = jnp.zeros((size, 2, width), x_pose.dtype).at[slot].add(slot_pose)
+    map_pose = map_pose.reshape(-1, width)
     return CovarianceBlocks(
         pose=G.pose + add_outer_products(jnp.zeros_like(G.pose), h_pose, 2 * x_pose),
         cross=2 * (add_outer_products(G.cross, h_pose, x_map) + map_pose.T),
@@ -324,18 +325,18 @@ def _grad_H(
     """
     gain, slot = factors.gain, saved.rows.slot
     m = slot.size
-    size = gain.map.shape[1] // 2
-    q_pose, q_map = factors.Q.pose.reshape(m, 2, 3), factors.Q.map.reshape(m, 2, -1)
+    size, width = gain.map.shape[1] // 2, gain.pose.shape[1]
+    q_pose, q_map = factors.Q.pose.reshape(m, 2, width), factors.Q.map.reshape(m, 2, -1)
     u, grad_v = factors.u.reshape(m, 2), grad_v.reshape(m, 2)
     shift = _shift(saved.Y, saved.w)
 
     pg_pose = saved.cov_pose @ g.pose + saved.cov_cross @ g.map  # (3,) P' g
     by_pose = -2 * (q_pose @ saved.cov_pose + q_map @ saved.cov_cross.T)
-    by_pose += u[..., None] * pg_pose[None, None] - grad_v[..., None] * shift[None, None, :3]
-    by_pose += 2 * grad_logdet * gain.pose.reshape(m, 2, 3)
+    by_pose += u[..., None] * pg_pose[None, None] - grad_v[..., None] * shift[None, None, :width]
+    by_pose += 2 * grad_logdet * gain.pose.reshape(m, 2, width)
 
     pg_slot = saved.cov_slot_pose @ g.pose + saved.cov_slot_map @ g.map  # (M, 2) P' g
-    shift_slot = shift[3:].reshape(-1, 2)[slot]
+    shift_slot = shift[width:].reshape(-1, 2)[slot]
     gain_slot = gain.map.reshape(m, 2, size, 2)[jnp.arange(m), :, slot]
     by_slot = -2 * (
         jnp.einsum("mip,mjp->mij", q_pose, saved.cov_slot_pose)

@@ -9,7 +9,7 @@ from jaxslam.core.se2 import transform, wrap_angle, wrap_direction
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering.belief import Belief, prune
 from jaxslam.filtering.covariance import downdate_rarely, put_rows, slot_rows
-from jaxslam.filtering.ekf import check_linearisation, with_gaussian
+from jaxslam.filtering.ekf import check_linearisation, covariance_blocks, with_gaussian
 from jaxslam.filtering.joint_covariance import CovarianceBlocks
 
 
@@ -34,7 +34,9 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     def difference(x: Array) -> Array:
         return x[..., 0, :] - x[..., 1, :]
 
-    hp_pose = difference(belief.cross_cov.reshape(3, size, 2)[:, pair]).T  # (2, 3) H P
+    before = covariance_blocks(belief)
+    width = len(before.pose)
+    hp_pose = difference(before.cross.reshape(width, size, 2)[:, pair]).T  # (2, 3) H P
     hp_map = slot_rows(belief.map_cov, pair)
     hp_map = hp_map[0] - hp_map[1]  # (2, 2 L)
     variance = std**2 * jnp.eye(2, dtype=hp_map.dtype)
@@ -44,12 +46,12 @@ def merge(belief: Belief, keep: Array, drop: Array, *, std: float = 0.01) -> Bel
     y_pose, y_map = root @ hp_pose, root @ hp_map
     white_residual = -root @ difference(belief.landmark_positions[pair])
     cov = CovarianceBlocks(
-        pose=add_outer_products(belief.pose_cov, y_pose, y_pose, sign=-1),
-        cross=add_outer_products(belief.cross_cov, y_pose, y_map, sign=-1),
+        pose=add_outer_products(before.pose, y_pose, y_pose, sign=-1),
+        cross=add_outer_products(before.cross, y_pose, y_map, sign=-1),
         map=downdate_rarely(belief.map_cov, y_map, found),
     )
     shift = jnp.concatenate([white_residual @ y_pose, white_residual @ y_map])
-    belief = with_gaussian(belief, belief.mean + shift, cov)
+    belief = with_gaussian(belief, shift, cov)
     gone = found & is_definite & (jnp.arange(size, dtype=jnp.int32) == drop)
     observations = belief.num_seen.at[drop].get(mode="fill", fill_value=0)
     observations = jnp.where(found & is_definite, observations, 0)
@@ -128,6 +130,10 @@ def augment(
     taken = slot < size
     new_id = belief.next_id + jnp.cumsum(taken, dtype=jnp.int32) - 1 if new_slot is None else slot
     cross_cov = belief.cross_cov.at[:, row].set(new_pose.T, mode="drop", unique_indices=True)
+    if belief.bias is not None:
+        new_bias = jnp.einsum("mij,kj->kmi", by_pose, belief.bias.pose_cov).reshape(-1, row.size)
+        map_rows = belief.bias.map_cov.at[:, row].set(new_bias, mode="drop", unique_indices=True)
+        belief = belief._replace(bias=belief.bias._replace(map_cov=map_rows))
     belief = belief._replace(
         mean=put_values(belief.mean),
         first_estimate=put_values(belief.first_estimate),

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from jaxslam.core.se2 import range_bearing, unit_vector
+from jaxslam.core.se2 import range_bearing, rotation, unit_vector
 from jaxslam.core.types import Array
 
 
@@ -49,6 +49,35 @@ def odometry_cov(coefficients: Array, increment: Array) -> Array:
         ]
     )
     return directions.T @ (jnp.stack([var_d, var_t, var_t / 12])[:, None] * directions)
+
+
+def odometry_rate_cov(rate: Array, increment: Array) -> Array:
+    """Process noise Q (3, 3) of errors that grow with the distance, in the frame of `odometry_cov`.
+
+    While the robot drives, errors of x, y and heading are added all the time, white, of covariance
+    `rate` per metre: it may hold sideways slip, and a correlation of distance with heading, which
+    four coefficients do not. An error at the fraction s = 0..1 of the increment is turned to its
+    mean direction T = diag(R(t / 2), 1), and its heading swings the rest of the increment: with p
+    as in `odometry_cov` and N = (p, 0) (0, 0, 1),
+
+        A = T rate T^T,      Q = d  integral of (I + (1 - s) N) A (I + (1 - s) N)^T  over s = 0..1
+                               = d (A + (N A + A N^T) / 2 + N A N^T / 3)
+
+    which is positive semi-definite if `rate` is, and exactly that of the coefficients
+    (o0, 0, o2, 0) if `rate` = diag(o0^2, 0, o2^2). A robot that turns in place gets none.
+
+    Args:
+        rate: (3, 3) covariance per distance driven [m^2, m rad, rad^2 per m]; frame of the robot,
+            x forward.
+        increment: (3,) the increment [m, m, rad].
+    """
+    distance = range_bearing(increment[:2])[0]
+    turned = jnp.eye(3, dtype=rate.dtype).at[:2, :2].set(rotation(increment[2] / 2))
+    cov = turned @ rate @ turned.T
+    sideways = jnp.stack([-increment[1], increment[0], jnp.zeros_like(distance)])
+    swung = sideways[:, None] * cov[2][None]  # N A
+    both = cov[2, 2] * sideways[:, None] * sideways[None]  # N A N^T
+    return distance * (cov + (swung + swung.T) / 2 + both / 3)
 
 
 def wheel_coefficients(wheel_base: float, encoder_noise: float) -> Array:

@@ -11,14 +11,22 @@ from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering import measurement_model
-from jaxslam.filtering.motion_model import odometry_cov, wheel_coefficients
+from jaxslam.filtering.heteroscedastic import (
+    MeasurementWeights,
+    OdometryWeights,
+    measurement_factors,
+    odometry_factors,
+)
+from jaxslam.filtering.motion_model import odometry_cov, odometry_rate_cov, wheel_coefficients
+from jaxslam.filtering.noise_model import NoiseModel, change_measurement_cov, change_odometry_cov
 from jaxslam.matching import odometry_fusion
 
 
 class NoiseParams(NamedTuple):
     """Standard deviations that the filter assumes; traced, so that gradients can tune them.
 
-    Every field is a standard deviation or a factor on one, never a variance.
+    Every field up to `scan_match_std_scale` is a standard deviation or a factor on one, never a
+    variance. Those after it are options; None is off, which costs nothing.
 
     Attributes:
         odometry_coefficients: (4,) coefficients of Q in `motion_model.odometry_cov`, standard
@@ -32,6 +40,16 @@ class NoiseParams(NamedTuple):
         wall_angle_std: () [rad] of a wall's direction, added likewise to the wall's own variance.
         scan_match_std_scale: () [-] factor on the standard deviation of scan-matched odometry; None
             where no scans are matched.
+        odometry_cov_rate: (3, 3) covariance per metre of errors of x, y and heading, in addition
+            to the coefficients; positive semi-definite (`motion_model.odometry_rate_cov`).
+        odometry_weights: Weights of factors on the standard deviations of Q, that depend on the
+            step; any sign (`heteroscedastic`).
+        measurement_weights: Likewise of R.
+        student_dof: () degrees of freedom of a Student t distribution that the innovations of
+            features have instead of a Gaussian (`robust`); Q and R are then scales.
+        odometry_bias_walk: (3,) growth of the standard deviations of the biases of odometry, per
+            root of a metre (`odometry_bias`); None: they are constant. 0 for one that is.
+        custom: Parameters of `FilterConfig.noise_model`: any tree of arrays, of any sign.
     """
 
     odometry_coefficients: Array
@@ -40,6 +58,12 @@ class NoiseParams(NamedTuple):
     feature_std_scale: Array
     wall_angle_std: Array
     scan_match_std_scale: Array | None = None
+    odometry_cov_rate: Array | None = None
+    odometry_weights: OdometryWeights | None = None
+    measurement_weights: MeasurementWeights | None = None
+    student_dof: Array | None = None
+    odometry_bias_walk: Array | None = None
+    custom: Any = None
 
     @classmethod
     def for_simulated_robot(
@@ -78,13 +102,18 @@ class NoiseParams(NamedTuple):
         return cls(*_arrays([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03))
 
 
-def _arrays(*numbers: Any) -> Iterator[Array]:
+def _arrays(*numbers: Any) -> Iterator[Any]:
     """Numbers as arrays of JAX's default float type."""
     return (jnp.asarray(x, float) for x in numbers)
 
 
 def measurement_cov(
-    params: NoiseParams, features: Features, *, untrusted_inflation: float = 1.0
+    params: NoiseParams,
+    features: Features,
+    measurement: Measurement,
+    *,
+    untrusted_inflation: float = 1.0,
+    noise_model: NoiseModel | None = None,
 ) -> Array:
     """Measurement covariance R (M, 2, 2) of the features of a scan.
 
@@ -95,11 +124,14 @@ def measurement_cov(
     front end's variance of a wall's direction, f the factor `params.feature_std_scale`, and s_ the
     standard deviations in `params`. k is 1 for a trusted point and `untrusted_inflation` for
     another. The second number of a wall's measurement is always 0; its variance 1 is a placeholder.
+    With `params.measurement_weights` each standard deviation has a factor (`heteroscedastic`).
 
     Args:
         params: Noise parameters.
-        features: Features of a scan.
+        features: Features of a scan, of the configured kinds.
+        measurement: Of the step, whose features they are.
         untrusted_inflation: Factor on the standard deviation of points that are not trusted.
+        noise_model: Functions that change R, if any.
     """
     own = jax.vmap(measurement_model.polar_cov)(features.xy, features.cov)
     added = jnp.diag(jnp.stack([params.range_std, params.bearing_std]) ** 2)
@@ -107,16 +139,26 @@ def measurement_cov(
     point = (params.feature_std_scale**2 * own + added[None]) * inflation[:, None, None]
     angle = params.feature_std_scale**2 * features.direction_variance + params.wall_angle_std**2
     zero = jnp.zeros_like(angle)
+    if params.measurement_weights is not None:
+        factors = measurement_factors(params.measurement_weights, features, measurement)
+        point *= factors[:, :2, None] * factors[:, None, :2]
+        angle *= factors[:, 2] ** 2
     wall = jnp.stack([jnp.stack([angle, zero], -1), jnp.stack([zero, zero + 1.0], -1)], axis=1)
-    return jnp.where((features.kind == WALL)[:, None, None], wall, point)
+    R = jnp.where((features.kind == WALL)[:, None, None], wall, point)
+    if noise_model is None:
+        return R
+    return change_measurement_cov(noise_model, params.custom, features, measurement, R)
 
 
-def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Array, Array]:
+def motion_estimate(
+    params: NoiseParams, measurement: Measurement, *, noise_model: NoiseModel | None = None
+) -> tuple[Array, Array]:
     """Odometry increment of a step, fused with scan matching where there is any.
 
     Args:
         params: Noise parameters.
         measurement: Odometry, and scan matching if any.
+        noise_model: Functions that change Q, if any.
 
     Returns:
         The increment (3,) [m, m, rad] since the step before, in the frame of that pose, and its
@@ -126,11 +168,25 @@ def motion_estimate(params: NoiseParams, measurement: Measurement) -> tuple[Arra
         ValueError: There is scan matching, and `params.scan_match_std_scale` is None; while
             tracing.
     """
-    motion_cov = odometry_cov(params.odometry_coefficients, measurement.odometry)
+    coefficients, rate = params.odometry_coefficients, params.odometry_cov_rate
+    scan_match_std_scale = params.scan_match_std_scale
+    if params.odometry_weights is not None:
+        distance, heading, matching = odometry_factors(params.odometry_weights, measurement)
+        coefficients *= jnp.stack([distance, distance, heading, heading])
+        if rate is not None:
+            each = jnp.stack([distance, distance, heading])
+            rate *= each[:, None] * each[None]
+        if scan_match_std_scale is not None:
+            scan_match_std_scale *= matching
+    motion_cov = odometry_cov(coefficients, measurement.odometry)
+    if rate is not None:
+        motion_cov += odometry_rate_cov(rate, measurement.odometry)
+    if noise_model is not None:
+        motion_cov = change_odometry_cov(noise_model, params.custom, measurement, motion_cov)
     if measurement.scan_match is None:
         return measurement.odometry, motion_cov
-    if params.scan_match_std_scale is None:
+    if scan_match_std_scale is None:
         raise ValueError("params.scan_match_std_scale is None, but measurement.scan_match is given")
     return odometry_fusion.fuse_odometry(
-        params.scan_match_std_scale, measurement.odometry, motion_cov, measurement.scan_match
+        scan_match_std_scale, measurement.odometry, motion_cov, measurement.scan_match
     )

@@ -1,7 +1,6 @@
 """One step of the EKF-SLAM filter, and the filter over an episode."""
 
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,51 +8,28 @@ from jax import lax
 
 from jaxslam.core.features import Features, restrict_features
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.se2 import rotation
 from jaxslam.core.types import WALL, Array
-from jaxslam.filtering import ekf
+from jaxslam.filtering import ekf, robust
+from jaxslam.filtering.adaptation import adapt
 from jaxslam.filtering.belief import Belief
-from jaxslam.filtering.config import FilterConfig, check_config, required_observations
+from jaxslam.filtering.config import (
+    FilterConfig,
+    check_config,
+    check_options,
+    required_observations,
+)
 from jaxslam.filtering.data_association import Association, Matches, associate, use_known_ids
 from jaxslam.filtering.inputs import check_inputs
 from jaxslam.filtering.joint_covariance import LinearizedMeasurements, mask_measurements
-from jaxslam.filtering.kalman import UpdateResult, innovation_cov, log_likelihood
+from jaxslam.filtering.kalman import UpdateResult, innovation_cov
 from jaxslam.filtering.match_verification import verify_matches
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
+from jaxslam.filtering.odometry_bias import correct_odometry, walk
+from jaxslam.filtering.robust import Score
+from jaxslam.filtering.step_info import StepInfo as StepInfo
+from jaxslam.filtering.step_info import degrees, step_info
 from jaxslam.filtering.track_management import add_landmarks, manage_tracks
-
-
-class StepInfo(NamedTuple):
-    """Diagnostics of one step; the next step does not depend on them.
-
-    Attributes:
-        pose: (3,) [m, m, rad] estimated, map frame.
-        pose_cov: (3, 3) its covariance.
-        slot: (M,) int32 slot of each feature's landmark, matched or new; L for none.
-        id: (M,) int32 id of that landmark, -1 for none.
-        used: (M,) bool, the feature updated the state.
-        nis: () normalised innovation squared, of all used features together.
-        dof: () int32 its degrees of freedom.
-        log_likelihood: () [nats] of the innovations.
-        finite: () bool, False where the update was not finite and was left out.
-        num_new: () int32 number of new landmarks.
-        num_pruned: () int32 number of landmarks that were pruned, unconfirmed ones included.
-        num_evicted: () int32 number of unconfirmed landmarks that were evicted from a full map.
-        num_merged: () int32 number of duplicates that were merged.
-    """
-
-    pose: Array
-    pose_cov: Array
-    slot: Array
-    id: Array
-    used: Array
-    nis: Array
-    dof: Array
-    log_likelihood: Array
-    finite: Array
-    num_new: Array
-    num_pruned: Array
-    num_evicted: Array
-    num_merged: Array
 
 
 def step(
@@ -67,6 +43,8 @@ def step(
         choose     the matches that update the state: confirmed landmarks, walls first
         linearise  their innovations
         verify     them jointly, and drop the rejected ones
+        reweight   the features, if their noise is a Student t distribution
+        adapt      the scales of Q and R to the innovations, if they adapt
         update     the belief; leave the update out if it is not finite
         manage     the tracks: record observations, prune landmarks, merge duplicates
         add        new landmarks, evicting unconfirmed ones from a full map
@@ -98,54 +76,95 @@ def step(
     """
     check_config(config)
     params, measurement = check_inputs(params, belief, measurement, over_time=False)
+    check_options(config, params, belief)
     return _compiled_step(config, params, belief, measurement)
 
 
-def _step(
+def unchecked_step(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> tuple[Belief, StepInfo]:
-    """`step`, of inputs that are checked."""
+    """`step` of inputs that are checked; not jitted, for a scan over time."""
     is_known = measurement.landmark_ids is not None
     if is_known:
         config = config._replace(confirm_count=1, wall_confirm_count=1)
-    features, features_cov = _select(config, params, measurement.features)
-    predicted = _predict(config, params, belief, measurement)
+    features, features_cov = _select(config, params, measurement)
+    if belief.adaptation is not None:
+        features_cov *= jnp.exp(belief.adaptation.log_variance[1])
+    predicted, odometry_cov = _predict(config, params, belief, measurement)
     found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
     matches = _choose(config, predicted, features, found.slot)
     chosen, rows = _linearise(config, predicted, features, features_cov, matches)
     if not is_known:
         predicted, rows, matches = _verify(config, predicted, chosen, rows, matches)
+    rows, score = _reweight(params, predicted, chosen, rows, matches)
+    predicted = _adapt(config, belief, predicted, odometry_cov, chosen, rows, matches)
     updated, result, matches = _update(config, predicted, rows, matches)
     tracked, pruned, merged = manage_tracks(config, updated, features, matches, is_known)
     found = found._replace(is_new=found.is_new & result.ok)
     mapped, new_slot, evicted = add_landmarks(config, tracked, features, features_cov, found)
-    info = _step_info(
-        mapped, features, matches, new_slot, result, pruned=pruned, merged=merged, evicted=evicted
+    info = step_info(
+        mapped,
+        features,
+        matches,
+        new_slot,
+        result,
+        score,
+        pruned=pruned,
+        merged=merged,
+        evicted=evicted,
     )
     return mapped, info
 
 
-_compiled_step = partial(jax.jit, static_argnames="config")(_step)
+_compiled_step = partial(jax.jit, static_argnames="config")(unchecked_step)
 
 
 def _select(
-    config: FilterConfig, params: NoiseParams, features: Features
+    config: FilterConfig, params: NoiseParams, measurement: Measurement
 ) -> tuple[Features, Array]:
     """Features of the configured kinds, and their measurement covariance R (M, 2, 2)."""
-    allowed = jnp.isin(features.kind, jnp.array(config.landmark_kinds, jnp.int32))
-    features = restrict_features(features, allowed)
+    kind = measurement.features.kind
+    allowed = jnp.isin(kind, jnp.array(config.landmark_kinds, jnp.int32))
+    features = restrict_features(measurement.features, allowed)
     return features, measurement_cov(
-        params, features, untrusted_inflation=config.untrusted_inflation
+        params,
+        features,
+        measurement,
+        untrusted_inflation=config.untrusted_inflation,
+        noise_model=config.noise_model,
     )
 
 
 def _predict(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
-) -> Belief:
-    """Predict by the odometry increment, and count the step."""
-    odometry, odometry_cov = motion_estimate(params, measurement)
-    belief = ekf.predict(belief, odometry, odometry_cov, linearisation=config.linearisation)
-    return belief._replace(step=belief.step + 1)
+) -> tuple[Belief, Array]:
+    """Predict by the odometry increment, and count the step.
+
+    Returns:
+        The belief, and the covariance Q (3, 3) of the increment in the frame of the pose before it.
+    """
+
+    def increment(bias: Array | None) -> tuple[Array, tuple[Array, Array]]:
+        given = measurement
+        if bias is not None:
+            given = given._replace(odometry=correct_odometry(bias, given.odometry))
+        odometry, odometry_cov = motion_estimate(params, given, noise_model=config.noise_model)
+        return odometry, (odometry, odometry_cov)
+
+    bias, by_bias = belief.bias, None
+    if bias is None:
+        odometry, odometry_cov = increment(None)[1]
+    else:
+        by_bias, (odometry, odometry_cov) = jax.jacfwd(increment, has_aux=True)(bias.mean)
+    if belief.adaptation is not None:
+        odometry_cov *= jnp.exp(belief.adaptation.log_variance[0])
+    belief = ekf.predict(
+        belief, odometry, odometry_cov, linearisation=config.linearisation, by_bias=by_bias
+    )
+    if belief.bias is not None and params.odometry_bias_walk is not None:
+        walked = walk(belief.bias, params.odometry_bias_walk, measurement.odometry)
+        belief = belief._replace(bias=walked)
+    return belief._replace(step=belief.step + 1), odometry_cov
 
 
 def _associate(
@@ -212,6 +231,46 @@ def _verify(
     return belief, rows, Matches(slot, used & ~rejected, order)
 
 
+def _reweight(
+    params: NoiseParams,
+    belief: Belief,
+    chosen: Features,
+    rows: LinearizedMeasurements,
+    matches: Matches,
+) -> tuple[LinearizedMeasurements, Score | None]:
+    """Weigh the features if their noise is a Student t distribution; else None is the score."""
+    if params.student_dof is None:
+        return rows, None
+    size = jnp.where(matches.used[matches.order], degrees(chosen), 0)
+    return robust.reweight(params.student_dof, ekf.covariance_blocks(belief), rows, size)
+
+
+def _adapt(
+    config: FilterConfig,
+    before: Belief,
+    belief: Belief,
+    odometry_cov: Array,
+    chosen: Features,
+    rows: LinearizedMeasurements,
+    matches: Matches,
+) -> Belief:
+    """The predicted belief with the scales of Q and R that follow from its innovations."""
+    if config.adaptation is None or belief.adaptation is None:
+        return belief
+    size = jnp.where(matches.used[matches.order], degrees(chosen), 0)
+    to_map_frame = jnp.eye(3, dtype=odometry_cov.dtype)
+    to_map_frame = to_map_frame.at[:2, :2].set(rotation(before.pose[2]))
+    adapted = adapt(
+        config.adaptation,
+        belief.adaptation,
+        ekf.covariance_blocks(belief),
+        rows,
+        size,
+        to_map_frame @ odometry_cov @ to_map_frame.T,
+    )
+    return belief._replace(adaptation=adapted)
+
+
 def _update(
     config: FilterConfig, belief: Belief, rows: LinearizedMeasurements, matches: Matches
 ) -> tuple[Belief, UpdateResult, Matches]:
@@ -228,39 +287,6 @@ def _update(
     slot = jnp.where(finite, matches.slot, belief.num_seen.size)
     matches = matches._replace(slot=slot, used=matches.used & finite)
     return updated, result._replace(ok=finite), matches
-
-
-def _step_info(
-    belief: Belief,
-    features: Features,
-    matches: Matches,
-    new_slot: Array,
-    result: UpdateResult,
-    *,
-    pruned: Array,
-    merged: Array,
-    evicted: Array,
-) -> StepInfo:
-    """Diagnostics of the step; the likelihood of an update that was left out is zero."""
-    size = belief.num_seen.size
-    slot = jnp.minimum(matches.slot, new_slot)
-    degrees = jnp.where(features.kind == WALL, 1, 2)
-    dof = jnp.sum(jnp.where(matches.used, degrees, 0), dtype=jnp.int32)
-    return StepInfo(
-        pose=belief.pose,
-        pose_cov=belief.pose_cov,
-        slot=slot,
-        id=belief.id.at[slot].get(mode="fill", fill_value=-1),
-        used=matches.used,
-        nis=jnp.where(result.ok, result.nis, 0.0),
-        dof=dof,
-        log_likelihood=jnp.where(result.ok, log_likelihood(result, dof), 0.0),
-        finite=result.ok,
-        num_new=jnp.sum(new_slot < size, dtype=jnp.int32),
-        num_pruned=pruned,
-        num_evicted=evicted,
-        num_merged=merged,
-    )
 
 
 def run_filter(
@@ -286,6 +312,7 @@ def run_filter(
     """
     check_config(config)
     params, measurements = check_inputs(params, belief, measurements, over_time=True)
+    check_options(config, params, belief)
     return _run(config, params, belief, measurements)
 
 
@@ -296,6 +323,6 @@ def _run(
     """`run_filter`, of inputs that are checked."""
 
     def body(belief: Belief, now: Measurement) -> tuple[Belief, StepInfo]:
-        return _step(config, params, belief, now)
+        return unchecked_step(config, params, belief, now)
 
     return lax.scan(body, belief, measurements)

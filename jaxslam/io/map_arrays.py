@@ -24,8 +24,10 @@ from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.types import CORNER, JUNCTION, WALL, check_array
 from jaxslam.filtering.belief import Belief
+from jaxslam.filtering.heteroscedastic import WEIGHTS
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.arc_tracing import POLYLINE_POINTS
+from jaxslam.io import noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.mapping.arc_table import ArcTable
 from jaxslam.mapping.saved_map import SavedMap
@@ -45,6 +47,7 @@ LAYOUT: Mapping[str, tuple[str, tuple[int | str, ...]]] = {
     "params.feature_std_scale": ("float", ()),
     "params.wall_angle_std": ("float", ()),
     "params.scan_match_std_scale": ("float", ()),
+    **{f"params.{key}": ("float", shape) for key, shape in noise_file.OPTIONAL.items()},
     "times": ("float64", ("K",)),
     "poses": ("float64", ("K", 3)),
     "pose_cov": ("float32", ("K", 3, 3)),
@@ -86,6 +89,7 @@ LAYOUT: Mapping[str, tuple[str, tuple[int | str, ...]]] = {
 }
 OPTIONAL = (
     "params.scan_match_std_scale",
+    *(f"params.{key}" for key in noise_file.OPTIONAL),
     "topological_map.arc_filled",
     "topological_map.frontier_id",
 )
@@ -99,14 +103,21 @@ _DERIVED: Mapping[str, Callable[[int], int]] = {
 
 
 def pack(saved: SavedMap) -> dict[str, np.ndarray]:
-    """The arrays of a map, not checked; ValueError if the covariance is no square matrix."""
+    """The arrays of a map, not checked; ValueError if the covariance is no square matrix.
+
+    Parameters of a noise model of one's own are left out: a file does not have the model.
+    """
     hit, graph = np.asarray(saved.scans.hit), saved.topological_map
     cov = np.asarray(saved.belief.map_cov)
     check_array("belief.map_cov", cov, (len(cov), len(cov)))
     lidar = Lidar(int(saved.lidar.num_beams), *map(float, saved.lidar[1:]))
     ranges = np.where(hit, saved.scans.ranges, np.float32(0.0))
     arrays = {name: np.asarray(getattr(saved, name)) for name in ("times", "poses", "pose_cov")}
-    arrays |= {"scans.ranges": ranges} | _fields("lidar", lidar) | _fields("params", saved.params)
+    arrays |= (
+        {"scans.ranges": ranges}
+        | _fields("lidar", lidar)
+        | _fields("params", saved.params._replace(custom=None))
+    )
     arrays |= _fields("belief", saved.belief._replace(map_cov=cov[_upper(len(cov))]))
     arrays |= _fields("arcs", saved.arcs)
     rest = {k: v for k, v in graph._asdict().items() if k not in ("arc_lines", "frontiers")}
@@ -133,7 +144,7 @@ def unpack(arrays: Arrays) -> SavedMap:
     }
     return SavedMap(
         lidar=lidar,
-        params=_record("params", NoiseParams, arrays),
+        params=_params(arrays),
         times=arrays["times"],
         poses=arrays["poses"],
         pose_cov=arrays["pose_cov"],
@@ -212,7 +223,7 @@ def _rules(arrays: Arrays) -> Iterator[tuple[str, Any, str]]:
     ranges = arrays["scans.ranges"]
     reach = np.float32(arrays["lidar.range_max"])
     yield "scans.ranges", ((ranges >= 0.0) & (ranges <= reach)).all(), "is not in [0, range_max]"
-    for name in NoiseParams._fields:
+    for name in noise_file.KEYS:
         value = arrays.get(f"params.{name}", np.zeros(()))
         yield f"params.{name}", (value >= 0.0).all(), "a standard deviation is below 0"
     ids = arrays["belief.id"]
@@ -247,13 +258,27 @@ def _rules(arrays: Arrays) -> Iterator[tuple[str, Any, str]]:
 
 def _fields(prefix: str, record: NamedTuple) -> dict[str, np.ndarray]:
     """The fields of a record as arrays, without those that are None."""
-    fields = record._asdict().items()
-    return {f"{prefix}.{name}": np.asarray(value) for name, value in fields if value is not None}
+    found: dict[str, np.ndarray] = {}
+    for name, value in record._asdict().items():
+        if hasattr(value, "_asdict"):
+            found |= _fields(f"{prefix}.{name}", value)
+        elif value is not None:
+            found[f"{prefix}.{name}"] = np.asarray(value)
+    return found
 
 
 def _record(prefix: str, kind: Any, arrays: Arrays) -> Any:
     """A record made of its fields, None where there is none."""
     return kind._make(arrays.get(f"{prefix}.{name}") for name in kind._fields)
+
+
+def _params(arrays: Arrays) -> NoiseParams:
+    """Noise parameters; a record of weights where there are some of it."""
+    params = _record("params", NoiseParams, arrays)
+    for field, kind in WEIGHTS.items():
+        if any(name.startswith(f"params.{field}.") for name in arrays):
+            params = params._replace(**{field: _record(f"params.{field}", kind, arrays)})
+    return params
 
 
 def _polylines(name: str, arrays: Arrays) -> tuple[np.ndarray, ...]:

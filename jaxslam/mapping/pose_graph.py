@@ -57,11 +57,17 @@ def _noise_model(
     config: FilterConfig, params: NoiseParams, measurements: Measurement
 ) -> tuple[Array, Array, Array]:
     """Motions (T, 3), their covariances (T, 3, 3), and those of features (T, M, 2, 2)."""
-    inflation = config.untrusted_inflation
+    inflation, model = config.untrusted_inflation, config.noise_model
 
     def of_scan(measurement: Measurement) -> tuple[Array, Array, Array]:
-        motion, q = motion_estimate(params, measurement)
-        r = measurement_cov(params, measurement.features, untrusted_inflation=inflation)
+        motion, q = motion_estimate(params, measurement, noise_model=model)
+        r = measurement_cov(
+            params,
+            measurement.features,
+            measurement,
+            untrusted_inflation=inflation,
+            noise_model=model,
+        )
         return motion, q, r
 
     return jax.vmap(of_scan)(measurements)

@@ -49,8 +49,12 @@ class SavedMap(NamedTuple):
 
 
 def used_landmarks(belief: Belief) -> Belief:
-    """The belief without its free slots, NumPy; its covariance dense and exactly symmetric."""
-    belief = jax.tree.map(np.asarray, belief._replace(map_cov=flush(belief.map_cov)))
+    """The belief without its free slots, NumPy; its covariance dense and exactly symmetric.
+
+    Biases of odometry and scales of the noise are of one drive, and not part of a map.
+    """
+    belief = belief._replace(map_cov=flush(belief.map_cov), bias=None, adaptation=None)
+    belief = jax.tree.map(np.asarray, belief)
     used = belief.num_seen > 0
     numbers = np.repeat(used, 2)  # (2 L,) the two numbers of each landmark
     state = np.append(np.ones(3, bool), numbers)

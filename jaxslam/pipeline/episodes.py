@@ -20,8 +20,10 @@ from jaxslam.core.se2 import dead_reckoning
 from jaxslam.core.time_series import match_times
 from jaxslam.core.types import Array, as_float64, check_array, check_type
 from jaxslam.filtering import slam_filter
+from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.config import FilterConfig, check_config, confirmed, init
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.features import features_from_range_bearing
@@ -72,6 +74,13 @@ def filter_episode(config: FilterConfig, params: NoiseParams, episode: Episode) 
     belief, info = slam_filter.run_filter(
         config, params, init(config, episode.truth[0]), measurements_of(episode)
     )
+    return trial_result(config, episode, belief, info)
+
+
+def trial_result(
+    config: FilterConfig, episode: Episode, belief: Belief, info: StepInfo
+) -> TrialResult:
+    """Result of the filter on one drive, from its last belief and its diagnostics [T]."""
     steps = len(episode.truth)
     mask, count = episode.truth_mask, episode.num_steps
     return TrialResult(
@@ -106,6 +115,13 @@ def filter_episodes(
             lead with B and T; or they hold scan matches that the parameters have no noise for, or
             landmarks that the map has no slots for.
     """
+    return filter_batch(config.filter, *check_drives(config, params, episodes))
+
+
+def check_drives(
+    config: Config, params: NoiseParams, episodes: Episode | list[Episode]
+) -> tuple[NoiseParams, Episode]:
+    """Noise and stacked episodes as the filter takes them; ValueError as of `filter_episodes`."""
     check_type("config", config, Config)
     check_config(config.filter)  # the scanner does not matter here
     stacked = as_episodes(episodes)
@@ -122,7 +138,7 @@ def filter_episodes(
                 f"episodes.landmark_ids holds {np.max(ids)}, but config.filter.max_landmarks is "
                 f"{capacity}: ids are 0 to max_landmarks - 1"
             )
-    return filter_batch(config.filter, params, stacked)
+    return params, stacked
 
 
 @partial(jax.jit, static_argnames="config")

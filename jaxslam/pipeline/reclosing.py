@@ -87,7 +87,7 @@ def close_again(run: Run, filtered: Filtered, result: SlamResult) -> tuple[Filte
         if not len(found.first):
             break
         problem = padded_problem(
-            run.config.filter.untrusted_inflation,
+            run.config.filter,
             run.params,
             filtered.start,
             measurements,

@@ -14,6 +14,7 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import increments
 from jaxslam.core.types import check_type
 from jaxslam.filtering.belief import grow_belief
+from jaxslam.filtering.config import with_options
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.mapping import arc_table
 from jaxslam.mapping.saved_map import SavedMap
@@ -70,7 +71,7 @@ def resume(config: Config, saved: SavedMap) -> SlamState:
     needed = max(used + chunks.MIN_FREE_SLOTS, -(-arcs.num_seen.size // 2))
     capacity = min(block * -(-needed // block), config.filter.max_landmarks)
     arcs = arc_table.grow_arcs(arcs, max(2 * capacity, arcs.num_seen.size))
-    return SlamState(grow_belief(belief, capacity), arcs, None)
+    return SlamState(with_options(config.filter, grow_belief(belief, capacity)), arcs, None)
 
 
 def with_saved_keyframes(

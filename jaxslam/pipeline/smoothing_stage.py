@@ -9,6 +9,7 @@ from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
 from jaxslam.core.types import AnyArray, Array
 from jaxslam.filtering.belief import Belief
+from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching import loop_closure
@@ -26,7 +27,7 @@ CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further th
 PADDING_MULTIPLE = 512
 
 _build_problem = trace_cache.jit(
-    smoothing_problem.build_problem, static_argnames="untrusted_inflation"
+    smoothing_problem.build_problem, static_argnames=("untrusted_inflation", "noise_model")
 )
 
 
@@ -73,7 +74,7 @@ def smooth_result(
         info.id, initial, measurements.features, capacity=capacity
     )
     problem, initial = padded_problem(
-        config.filter.untrusted_inflation,
+        config.filter,
         params,
         start,
         measurements,
@@ -139,7 +140,7 @@ def _padded(count: int) -> int:
 
 
 def padded_problem(
-    untrusted_inflation: float,
+    config: FilterConfig,
     params: NoiseParams,
     start: Array,
     measurements: Measurement,
@@ -149,7 +150,7 @@ def padded_problem(
     """Smoothing problem and guess (P, 3), padded by steps without motion and measurements.
 
     Args:
-        untrusted_inflation: Of the filter's configuration.
+        config: Of the filter.
         params: Q and R of the filter.
         start: (3,) first pose.
         measurements: [T].
@@ -164,7 +165,12 @@ def padded_problem(
     if measurements.scan_match is not None:
         measurements.scan_match.increment[steps:] = 0.0
     problem = _build_problem(
-        params, start, measurements, index, untrusted_inflation=untrusted_inflation
+        params,
+        start,
+        measurements,
+        index,
+        untrusted_inflation=config.untrusted_inflation,
+        noise_model=config.noise_model,
     )
     return problem, guess
 

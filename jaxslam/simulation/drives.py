@@ -96,13 +96,25 @@ def num_scans_of_drive(robot: Robot, path: Any) -> int:
 
 
 def simulate_episode(
-    key: Key, config: FrontendConfig, robot: Robot, world: World, path: Array, *, num_scans: int
+    key: Key,
+    config: FrontendConfig,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
 ) -> Episode:
-    """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features."""
+    """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
+
+    The standard deviation of a range has the factor exp(`noise_by_incidence` times the angle [rad]
+    between its beam and the normal of the wall).
+    """
     truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
 
     def features(item: tuple[Array, Key]) -> Features:
-        return extract.extract_features(config, _scan(config.lidar, world, *item))
+        scan = _scan(config.lidar, world, *item, noise_by_incidence=noise_by_incidence)
+        return extract.extract_features(config, scan)
 
     extracted = map_batches(features, (truth, scan_keys), batch_size=extract.SCAN_BATCH)
     return Episode(truth=truth, odometry=odometry, features=extracted)
@@ -123,6 +135,11 @@ def _drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Arra
     return truth, odometry, jax.random.split(scan_key, num_scans)
 
 
-def _scan(lidar: Lidar, world: World, pose: Array, key: Key) -> Scan:
+def _scan(
+    lidar: Lidar, world: World, pose: Array, key: Key, *, noise_by_incidence: float = 0.0
+) -> Scan:
     """Noisy scan of the world from a pose (3,)."""
-    return ray_casting.add_range_noise(key, lidar, ray_casting.cast(lidar, world, pose))
+    factors = None
+    if noise_by_incidence != 0.0:
+        factors = jnp.exp(noise_by_incidence * ray_casting.incidence(lidar, world, pose))
+    return ray_casting.add_range_noise(key, lidar, ray_casting.cast(lidar, world, pose), factors)

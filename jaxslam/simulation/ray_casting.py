@@ -29,6 +29,11 @@ def cast(lidar: Lidar, world: World, pose: Array) -> Scan:
     """
     check_array("world.walls", world.walls, ("S", 4), jnp.floating)
     check_array("pose", pose, (3,), jnp.floating)
+    return to_scan(lidar, jnp.min(_distances(lidar, world, pose), axis=1))
+
+
+def _distances(lidar: Lidar, world: World, pose: Array) -> Array:
+    """Distances (R, S) [m] along each beam to each wall, infinite where it does not meet it."""
     beam = unit_vector(pose[2] + beam_angles(lidar))[:, None, :]  # (R, 1, 2)
     walls = jnp.asarray(world.walls)
     start = (walls[:, :2] - pose[None, :2])[None]  # (1, S, 2)
@@ -39,11 +44,34 @@ def cast(lidar: Lidar, world: World, pose: Array) -> Scan:
     distance = cross(start, along) / safe  # t
     fraction = cross(start, beam) / safe  # s
     met = crosses & (distance > 1e-6) & (jnp.abs(fraction - 0.5) <= 0.5 + SEAM)
-    ranges = jnp.min(jnp.where(met, distance, jnp.inf), axis=1)
-    return to_scan(lidar, ranges)
+    return jnp.where(met, distance, jnp.inf)
 
 
-def add_range_noise(key: Key, lidar: Lidar, scan: Scan) -> Scan:
-    """Add the range noise of the lidar to a scan; ranges beyond the largest become no return."""
+def incidence(lidar: Lidar, world: World, pose: Array) -> Array:
+    """Angle (R,) [rad] between each beam and the normal of the wall that it meets, 0 to pi / 2.
+
+    Where it meets none, it is that of some wall.
+    """
+    beam = unit_vector(pose[2] + beam_angles(lidar))  # (R, 2)
+    walls = jnp.asarray(world.walls)
+    length = jnp.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
+    along = (walls[:, 2:] - walls[:, :2]) / jnp.maximum(length, 1e-9)[:, None]
+    grazing = jnp.abs(cross(beam[:, None], along[None]))  # (R, S) sine of the angle to the wall
+    nearest = jnp.argmin(_distances(lidar, world, pose), axis=1)
+    sine = jnp.take_along_axis(grazing, nearest[:, None], axis=1)[:, 0]
+    return jnp.arccos(jnp.minimum(sine, 1.0))
+
+
+def add_range_noise(key: Key, lidar: Lidar, scan: Scan, factors: Array | None = None) -> Scan:
+    """Add the range noise of the lidar to a scan; ranges beyond the largest become no return.
+
+    Args:
+        key: Of the noise.
+        lidar: The scanner.
+        scan: Without noise.
+        factors: (R,) on the standard deviation of each beam; None: 1.
+    """
     noise = lidar.range_std * jax.random.normal(key, scan.ranges.shape, scan.ranges.dtype)
+    if factors is not None:
+        noise *= factors
     return to_scan(lidar, jnp.where(scan.hit, scan.ranges + noise, jnp.inf))

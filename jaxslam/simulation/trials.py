@@ -12,7 +12,7 @@ from jax import lax
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import Array, Key, as_count
+from jaxslam.core.types import Array, Key, as_count, as_size
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
@@ -108,20 +108,41 @@ def replay_trial(
 
 
 def simulate_keys(
-    keys: Key, config: Config, robot: Robot, world: World, path: Array, *, num_scans: int
+    keys: Key,
+    config: Config,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
 ) -> Episode:
     """Simulate one trial of `num_scans` scans for each of the keys (B,)."""
-    return _simulate_keys(keys, config.frontend, robot, world, path, num_scans=num_scans)
+    return _simulate_keys(
+        keys,
+        config.frontend,
+        robot,
+        world,
+        path,
+        num_scans=num_scans,
+        noise_by_incidence=noise_by_incidence,
+    )
 
 
-@partial(jax.jit, static_argnames=("config", "robot", "num_scans"))
+@partial(jax.jit, static_argnames=("config", "robot", "num_scans", "noise_by_incidence"))
 def _simulate_keys(
-    keys: Key, config: FrontendConfig, robot: Robot, world: World, path: Array, *, num_scans: int
+    keys: Key,
+    config: FrontendConfig,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
 ) -> Episode:
     """`simulate_keys`, compiled for the front end alone."""
-    return lax.map(
-        lambda key: simulate_episode(key, config, robot, world, path, num_scans=num_scans), keys
-    )
+    one = partial(simulate_episode, num_scans=num_scans, noise_by_incidence=noise_by_incidence)
+    return lax.map(lambda key: one(key, config, robot, world, path), keys)
 
 
 def trial_keys(key: Key, trials: Array) -> Key:
@@ -138,6 +159,7 @@ def simulate_episodes(
     *,
     num_trials: int,
     num_scans: int | None = None,
+    noise_by_incidence: float = 0.0,
 ) -> Episode:
     """Simulate trials 0 to B - 1: drives of a robot along a path, and the features of its scans.
 
@@ -150,6 +172,8 @@ def simulate_episodes(
             default.
         num_trials: B, number of trials.
         num_scans: T, scans of a trial; to the end of the path by default.
+        noise_by_incidence: [1 / rad] by which the logarithm of the standard deviation of a range
+            grows with the angle between its beam and the normal of the wall.
 
     Returns:
         [B] episodes.
@@ -160,7 +184,15 @@ def simulate_episodes(
     given = _drive_of(key, config, robot, world, path, num_scans)
     keys = trial_keys(key, jnp.arange(as_count("num_trials", num_trials)))
     robot, walls, points, steps = given
-    return simulate_keys(keys, config, robot, walls, points, num_scans=steps)
+    return simulate_keys(
+        keys,
+        config,
+        robot,
+        walls,
+        points,
+        num_scans=steps,
+        noise_by_incidence=as_size("noise_by_incidence", noise_by_incidence, unit="1 / rad"),
+    )
 
 
 class _Common(NamedTuple):

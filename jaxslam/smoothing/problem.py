@@ -18,6 +18,7 @@ from jaxslam.core.types import AnyArray, Array, check_array
 from jaxslam.filtering import measurement_model
 from jaxslam.filtering.inputs import as_features, as_scan_match, check_params
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
+from jaxslam.filtering.noise_model import NoiseModel
 
 ODOMETRY_STD_FLOOR = 1e-4
 """[m], [rad] std added to each odometry increment: that of a robot at rest is zero."""
@@ -82,6 +83,7 @@ def build_problem(
     *,
     prior: LandmarkPrior | None = None,
     untrusted_inflation: float = 1.0,
+    noise_model: NoiseModel | None = None,
 ) -> SmoothingProblem:
     """The batch problem of a filter's measurements.
 
@@ -94,6 +96,7 @@ def build_problem(
         prior: Of the landmarks.
         untrusted_inflation: Factor on the standard deviation of untrusted features, as
             `FilterConfig.untrusted_inflation`; static.
+        noise_model: Functions that change Q and R, as `FilterConfig.noise_model`; static.
 
     Raises:
         ValueError: An argument has another shape or kind, or `untrusted_inflation` is not above
@@ -108,12 +111,17 @@ def build_problem(
     params = check_params(params, measurements.odometry.dtype)
     landmark_index = as_index("landmark_index", landmark_index, measurements.features.kind.shape)
     problem = _build_problem(
-        params, start, measurements, landmark_index, untrusted_inflation=float(untrusted_inflation)
+        params,
+        start,
+        measurements,
+        landmark_index,
+        untrusted_inflation=float(untrusted_inflation),
+        noise_model=noise_model,
     )
     return problem._replace(prior=None if prior is None else _as_prior("prior", prior, "L"))
 
 
-@partial(jax.jit, static_argnames="untrusted_inflation")
+@partial(jax.jit, static_argnames=("untrusted_inflation", "noise_model"))
 def _build_problem(
     params: NoiseParams,
     start: Array,
@@ -121,18 +129,22 @@ def _build_problem(
     landmark_index: Array,
     *,
     untrusted_inflation: float,
+    noise_model: NoiseModel | None,
 ) -> SmoothingProblem:
     """`build_problem` of what has been checked, without a prior."""
     features = jax.vmap(restrict_features)(measurements.features, landmark_index >= 0)
-    odometry, odometry_cov = jax.vmap(motion_estimate, in_axes=(None, 0))(params, measurements)
+    of_odometry = partial(motion_estimate, noise_model=noise_model)
+    odometry, odometry_cov = jax.vmap(of_odometry, in_axes=(None, 0))(params, measurements)
     floor = ODOMETRY_STD_FLOOR**2 * jnp.eye(3, dtype=odometry_cov.dtype)
-    of_features = partial(measurement_cov, params, untrusted_inflation=untrusted_inflation)
+    of_features = partial(
+        measurement_cov, params, untrusted_inflation=untrusted_inflation, noise_model=noise_model
+    )
     return SmoothingProblem(
         start=start,
         odometry=odometry,
         odometry_cov=odometry_cov + floor[None],
         measurement=jax.vmap(measurement_model.measure)(features),
-        measurement_cov=jax.vmap(of_features)(features),
+        measurement_cov=jax.vmap(of_features)(features, measurements),
         kind=features.kind,
         landmark_index=jnp.where(features.valid, landmark_index, -1),
     )

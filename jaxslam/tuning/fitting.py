@@ -26,7 +26,7 @@ from jaxslam.core.types import Array, as_count
 from jaxslam.pipeline.config import Config
 from jaxslam.tuning import parameters
 from jaxslam.tuning.inputs import check_alike
-from jaxslam.tuning.losses import Loss, check_loss, default_loss, resolve
+from jaxslam.tuning.losses import Loss, check_loss, default_loss, model_for, resolve
 from jaxslam.tuning.model import Model, num_steps, run_model
 from jaxslam.tuning.optimizers import default_optimizer
 from jaxslam.tuning.parameters import constrain, trainable_mask, unconstrain, unflatten_params
@@ -88,8 +88,8 @@ def prepare(
     used = of_leaves(params, transforms)
     arrays = parameters.as_params(params, transforms)
     function = default_loss(stacked) if loss is None else resolve(loss)
-    check_loss(function, stacked, name=name)
-    return Problem(model, function, used, arrays, stacked)
+    check_loss(function, stacked, name=name, model=model)
+    return Problem(model_for(function, model), function, used, arrays, stacked)
 
 
 def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any) -> Array:

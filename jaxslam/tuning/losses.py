@@ -17,6 +17,15 @@ from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.types import Array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, pose_error
 from jaxslam.filtering.slam_filter import StepInfo
+from jaxslam.tuning.model import Model
+from jaxslam.tuning.prediction import (
+    Comparison,
+    Memories,
+    closure_nll,
+    nis_consistency,
+    prediction_nll,
+    run_twice,
+)
 
 Loss = Callable[[Any, Any], Array]
 
@@ -77,14 +86,28 @@ class WeightedLoss(NamedTuple):
 
     terms: tuple[tuple[float, Loss], ...]
 
-    def __call__(self, info: StepInfo, episode: Episode) -> Array:
+    def __call__(self, info: StepInfo | Memories, episode: Episode) -> Array:
         """The weighted sum ()."""
-        first, *rest = [weight * loss(info, episode) for weight, loss in self.terms]
+        first, *rest = [weight * self._term(loss, info, episode) for weight, loss in self.terms]
         return sum(rest, start=first)
+
+    @staticmethod
+    def _term(loss: Loss, info: StepInfo | Memories, episode: Episode) -> Array:
+        """A term (); what needs no comparison of memories is of the whole memory."""
+        if isinstance(info, Memories) and not isinstance(loss, Comparison):
+            info = info.whole
+        return loss(info, episode)
 
 
 BY_NAME: Mapping[str, Loss] = MappingProxyType(
-    {"pose_nll": pose_nll, "pose_mse": pose_mse, "innovation_nll": innovation_nll}
+    {
+        "pose_nll": pose_nll,
+        "pose_mse": pose_mse,
+        "innovation_nll": innovation_nll,
+        "prediction_nll": prediction_nll,
+        "closure_nll": closure_nll,
+        "nis_consistency": nis_consistency,
+    }
 )
 """The losses by name, as `jaxslam tune --loss` takes them."""
 
@@ -112,6 +135,17 @@ def name_of(loss: Loss) -> str:
     raise ValueError(f"{loss!r} is none of {', '.join(BY_NAME)}")
 
 
+def comparisons(loss: Loss) -> list[Comparison]:
+    """The losses among the terms that compare a model with itself with less memory."""
+    terms = [term for _, term in loss.terms] if isinstance(loss, WeightedLoss) else [loss]
+    return [term for term in terms if isinstance(term, Comparison)]
+
+
+def model_for(loss: Loss, model: Model) -> Model:
+    """The model itself, or run twice where the loss compares it with itself with less memory."""
+    return run_twice(model, found[0]) if (found := comparisons(loss)) else model
+
+
 def default_loss(data: Any) -> Loss:
     """The loss that is minimised where none is named, by the data: `pose_nll` of episodes."""
     return pose_nll if isinstance(data, Episode) else innovation_nll
@@ -124,27 +158,41 @@ def needs_truth(loss: Loss) -> bool:
     return loss in (pose_mse, pose_nll)
 
 
-def check_loss(loss: Loss, data: Any, *, name: str = "episodes") -> None:
+def check_loss(
+    loss: Loss, data: Any, *, name: str = "episodes", model: Model | None = None
+) -> None:
     """Check, before any work starts, that a loss can be evaluated on data [B].
 
     Args:
         loss: The loss.
         data: [B] sequences; episodes as `inputs.as_episodes` returns them.
         name: What they are called in the error message.
+        model: The model that is tuned, if it is known.
 
     Raises:
         ValueError: The loss is no function, or a sum without terms; there are no episodes, or
-            none with a step; or one has no ground truth and the loss needs it.
+            none with a step; or one has no ground truth and the loss needs it, or nothing that
+            the loss predicts.
     """
     if not callable(loss):
         named = f"losses.BY_NAME has {', '.join(BY_NAME)}"
         raise ValueError(f"loss is {loss!r}, not a function of step infos and an episode; {named}")
     if isinstance(loss, WeightedLoss) and not loss.terms:
         raise ValueError("loss is a WeightedLoss without terms")
+    compared = comparisons(loss)
+    if len(compared) > 1:
+        raise ValueError("loss is a WeightedLoss of two losses that run the model twice; take one")
     if not isinstance(data, Episode):
         if needs_truth(loss):
             raise ValueError(f"loss {loss!r} is of episodes, which {name} are not")
-        return
+    else:
+        _check_episodes(loss, data, name)
+    for term in compared:
+        term.check(model, data, name)
+
+
+def _check_episodes(loss: Loss, data: Episode, name: str) -> None:
+    """Raise ValueError if there are no episodes, or no ground truth that the loss needs."""
     if not np.size(data.odometry):
         raise ValueError(f"{name}: no episodes, or none with a step")
     if needs_truth(loss) and data.truth_mask is not None:
@@ -152,7 +200,7 @@ def check_loss(loss: Loss, data: Any, *, name: str = "episodes") -> None:
         if missing.size:
             raise ValueError(
                 f"{name}: episode {missing[0]} has no reference, which this loss needs; give one, "
-                "or use losses.innovation_nll"
+                "or use a loss that needs none, as losses.closure_nll"
             )
 
 

@@ -9,7 +9,7 @@ from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.belief import Belief
-from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.config import FilterConfig, check_options
 from jaxslam.filtering.config import init as initial_belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
@@ -46,7 +46,7 @@ class SlamStep(NamedTuple):
         self, params: NoiseParams, belief: Belief, now: Measurement
     ) -> tuple[Belief, StepInfo]:
         """One step of `slam_filter`."""
-        return slam_filter.step(self.config, params, belief, now)
+        return slam_filter.unchecked_step(self.config, params, belief, now)
 
 
 def measurements(params: NoiseParams, episode: Episode) -> Measurement:
@@ -72,9 +72,10 @@ class SlamCheck(NamedTuple):
         Raises:
             ValueError: A field of the noise or of the episodes has another shape or kind; or there
                 are scan matches without a factor on them, or the reverse; or landmark ids above
-                the capacity.
+                the capacity; or parameters of an option that the filter's configuration has not.
         """
         params = as_params(params, positive=False)
+        check_options(self.config, params)
         stacked = as_episodes(episodes, name=name)
         check_scan_matching(params, stacked, name=name)
         capacity, ids = self.config.max_landmarks, stacked.landmark_ids

@@ -175,7 +175,14 @@ CALIBRATION = Calibration._make(
 )
 """Transforms of a `Calibration`; the scales are [rad / m], [m, m, rad] and [s]."""
 
-BY_FIELD: Mapping[str, Transform] = MappingProxyType({})
+BY_FIELD: Mapping[str, Transform] = MappingProxyType(
+    {
+        "odometry_cov_rate": CHOLESKY,
+        "odometry_weights": REAL,
+        "measurement_weights": REAL,
+        "custom": REAL,
+    }
+)
 """Transforms of fields of `NoiseParams` that are no standard deviations; others are positive."""
 
 

@@ -24,7 +24,7 @@ MAIN = (
 )
 ROBOTS, UPDATES = 5, 12
 KILLS = 2  # times that the command is killed, without losing an evaluation
-FILES = {"noise.json", "metrics.json", "history.png"}
+FILES = {"noise.json", "metrics.json", "report.png", "history.png"}
 FILE_KEYS = ["odometry", "range", "bearing", "scale", "wall", "alignment"]
 
 
@@ -97,7 +97,8 @@ def stopped(done):
 def test_it_writes_its_files_and_nothing_else(done):
     assert {file.name for file in done.out.iterdir()} == FILES
     assert {file.name for file in done.place.iterdir()} == {"drives", "whole", "cache"}
-    assert (done.out / "history.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("history.png", "report.png"):
+        assert (done.out / name).read_bytes().startswith(b"\x89PNG")
 
 
 def test_tuning_improves_loss_and_consistency(done):
@@ -147,6 +148,44 @@ def test_standard_errors_and_warnings_are_written(done):
         assert noise_file.name_of(name) in done.numbers["warnings"][0]
 
 
+def test_consistency_parameters_and_correlations_are_written(done):
+    numbers = done.numbers
+    before, after = (numbers["consistency"][when] for when in ("before", "after"))
+    assert abs(np.log(after["nis_per_dof"])) < abs(np.log(before["nis_per_dof"]))
+    assert before["nis_count"] == after["nis_count"] == 19, "every second of 39 steps has features"
+    assert after["nees_per_dof"] == pytest.approx(numbers["nees"], rel=1e-4)
+    assert list(after["autocorrelation"]) == ["heading", "to the left", "ahead"]
+    for series in after["autocorrelation"].values():
+        assert series[0] == pytest.approx(1.0) and len(series) >= 2
+    low, high = after["nis_per_dof_interval"]
+    assert low < after["nis_per_dof"] < high and 0.0 <= after["ljung_box_p"] <= 1.0
+    assert after["verdicts"] and before["verdicts"]
+
+    errors, parameters = numbers["standard_errors"], numbers["parameters"]
+    assert list(parameters) == list(errors)
+    for name, each in parameters.items():
+        field, _, index = name.partition("[")
+        found, start = numbers["noise"][field], numbers["before"]["noise"][field]
+        pick = int(index[:-1]) if index else None
+        assert each["value"] == pytest.approx(found if pick is None else found[pick])
+        assert each["before"] == pytest.approx(start if pick is None else start[pick])
+        assert each["frozen"] == (name == "wall")
+        if errors[name] is None:
+            assert each["interval"] is None
+        else:
+            ratio = np.exp(1.959964 * errors[name])
+            expected = [each["value"] / ratio, each["value"] * ratio]
+            assert each["interval"] == pytest.approx(expected)
+    names = numbers["correlations"]["names"]
+    assert names == [name for name in errors if name != "wall"]
+    matrix = numbers["correlations"]["matrix"]
+    for i, name in enumerate(names):
+        assert (matrix[i][i] is None) == (errors[name] is None)
+        for j in range(len(names)):
+            assert matrix[i][j] == matrix[j][i] or matrix[i][j] == pytest.approx(matrix[j][i])
+            assert matrix[i][j] is None or abs(matrix[i][j]) <= 1.0 + 1e-6
+
+
 def test_progress_and_a_summary_are_printed(done):
     assert f"{UPDATES + 1}/{UPDATES + 1}" in done.errors and "heldout=" in done.errors
     said = done.said.splitlines()
@@ -158,7 +197,9 @@ def test_progress_and_a_summary_are_printed(done):
         done.numbers["noise"]["bearing"], rel=1e-3
     )
     assert table["bearing_std"][2] == f"{done.numbers['standard_errors']['bearing']:.0%}"
-    assert said[-1].startswith(f"results: {done.out}") and len(said) < 24
+    assert said[-1].startswith(f"results: {done.out}") and len(said) < 28
+    found = [line.removeprefix("filter: ") for line in said if line.startswith("filter: ")]
+    assert found == done.numbers["consistency"]["after"]["verdicts"][:3]
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ NEWTON_UPDATES = 8  # then, on all drives
 CAUTION = 5.0  # factor on the odometry's noise at a start, so that a robot that is off is possible
 FACTOR = 2.0  # within which each noise of a start is off
 STRAIGHT = [(1.0, 1.0), (4.5, 1.0)]
-STRAIGHT_RUNS, STRAIGHT_NOISE = 8, 0.001  # drives, [m / sqrt(m)] of the encoders
+NUM_STRAIGHT, STRAIGHT_NOISE = 8, 0.001  # drives, [m / sqrt(m)] of the encoders
 UNCALIBRATED_UPDATES, KNOWN_UPDATES = 30, 30
 NOISE_NUMBERS = 8  # of the parameters, before those of the calibration
 MAX_CHANGE = 0.4  # of a number in one step of Newton's method
@@ -78,7 +78,7 @@ def newton(hessian: np.ndarray) -> optax.GradientTransformation:
     """Newton's method with one Hessian (P, P), along the directions that are clearly curved.
 
     The noise and the calibration are correlated, and a minimum that is missed by a standard error
-    cannot be told from one that is off: L-BFGS takes long for the last of it.
+    looks like one that is off: L-BFGS takes long for the last of it.
     """
     curvature, direction = np.linalg.eigh(hessian)
     kept = curvature > LEAST_CURVATURE * curvature.max()
@@ -273,7 +273,7 @@ def straight(seed: int, num_scans: int) -> common.Numbers:
     """What drives straight ahead do not determine, by a robot with good wheels."""
     robot = Robot(encoder_noise=STRAIGHT_NOISE, mount=HURT.mount, time_offset=HURT.time_offset)
     drives = calibration_drives.drives(
-        jax.random.key(seed), robot, num_trials=STRAIGHT_RUNS, path=STRAIGHT, num_scans=num_scans
+        jax.random.key(seed), robot, num_trials=NUM_STRAIGHT, path=STRAIGHT, num_scans=num_scans
     )
     noise = calibration_drives.measurement_noise()
     own = noise.odometry_coefficients * (STRAIGHT_NOISE / HURT.encoder_noise)

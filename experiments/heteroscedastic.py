@@ -29,6 +29,8 @@ from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.heteroscedastic import MeasurementWeights, incidence
 from jaxslam.filtering.measurement_model import measure, predict_measurement, residual
 from jaxslam.filtering.noise import NoiseParams, measurement_cov
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.features import FeatureSpec
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
@@ -41,7 +43,7 @@ GROWTH = 1.5  # [1 / rad] of the logarithm of the standard deviation of a range
 RANGE_STD = 0.005  # [m] of a corner at normal incidence
 LANDMARKS = 64  # capacity of the map of the simulated scans
 BINS = 6  # of incidence, with equal numbers of features
-# The direction of a wall has no incidence; only corners have.
+# The walls of `exact_model` have no incidence; only its corners have.
 FROZEN = ("measurement_weights.incidence[2]",)
 
 
@@ -95,7 +97,10 @@ def exact(seed: int, num_trials: int, num_heldout: int, num_scans: int | None) -
 
 def scans(seed: int, num_trials: int, num_heldout: int, num_scans: int | None) -> Task:
     """Simulated scans whose range noise grows with incidence, and the features found in them."""
-    config = Config(filter=FilterConfig(max_landmarks=LANDMARKS))
+    spec = FeatureSpec(incidence=True)
+    config = Config(
+        frontend=FrontendConfig(features=spec), filter=FilterConfig(max_landmarks=LANDMARKS)
+    )
     drives = trials.simulate_episodes(
         jax.random.key(seed),
         config,
@@ -110,11 +115,7 @@ def scans(seed: int, num_trials: int, num_heldout: int, num_scans: int | None) -
         MeasurementWeights(incidence=zero, range=zero, clearance=zero),
         common.take(drives, slice(num_trials)),
         common.take(drives, slice(num_trials, None)),
-        (
-            *FROZEN,
-            "measurement_weights.range[2]",
-            "measurement_weights.clearance[2]",
-        ),
+        ("measurement_weights.range[2]", "measurement_weights.clearance[2]"),  # not of walls
     )
 
 
@@ -176,11 +177,11 @@ def _score(task: Task, params: NoiseParams) -> common.Numbers:
 
 @jax.jit
 def _step_incidence(features: Features) -> Array:
-    """Mean incidence (B, T) [rad] of the corners of each scan; NaN where there is none."""
+    """Mean incidence (B, T) [rad] of the features that have one; NaN where there is none."""
     angle = jax.vmap(jax.vmap(incidence))(features)
-    is_corner = features.valid & (features.kind == CORNER)
-    count = jnp.sum(is_corner, axis=-1)
-    mean = jnp.sum(jnp.where(is_corner, angle, 0.0), axis=-1) / jnp.maximum(count, 1)
+    known = features.valid & (angle > 0.0)
+    count = jnp.sum(known, axis=-1)
+    mean = jnp.sum(jnp.where(known, angle, 0.0), axis=-1) / jnp.maximum(count, 1)
     return jnp.where(count > 0, mean, jnp.nan)
 
 

@@ -186,7 +186,7 @@ def rows(
         parts = []
         for view, features in views:
             use = pick(view)
-            some = Features(*(field[np.tile(use, 2)] for field in features))
+            some = jax.tree.map(lambda field, use=use: field[np.tile(use, 2)], features)
             parts.append(check(case.config, view.take(use), some, kinds))
         for kind in kinds:
             head = {"world": name, "labels": LABEL_KEYS[case.labels], "noise_m": case.range_std}

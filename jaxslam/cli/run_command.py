@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import report, room_results, run_results, summaries
+from jaxslam.cli import calibrated_logs, report, room_results, run_results, summaries
 from jaxslam.cli.log_options import (
     Scanner,
     ScannerOptions,
@@ -60,6 +60,8 @@ def run(
     odometry: OdometrySource = "scan",
     smooth: bool = True,
     noise: OptionalFile = None,
+    calibrate: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    calibration: FileOfEach = (),
     saved_map: Annotated[
         Path | None, tyro.conf.arg(name="map", metavar="DIR", help_behavior_hint="")
     ] = None,
@@ -105,6 +107,12 @@ def run(
         smooth: Batch-smooth the trajectory and landmarks, with loop closures; --no-smooth writes
             the online estimates.
         noise: File of the noise parameters of the filter (Q and R); by default cautious ones.
+        calibrate: Calibrate the robot by the log itself: its wheels, the scanner's mount and the
+            clocks of both, by scan matching against odometry; odometry is then corrected, and
+            calibration.json written. Not with --odometry scans-only.
+        calibration: Calibration of the robot, as --calibrate wrote it, on top of the mount of the
+            log or of --mount; with --calibrate it is where that begins. Once for all logs, or once
+            for each.
         saved_map: Output folder of an earlier run, of the same scanner, whose map is continued:
             where its places are found again, landmarks keep their ids, new ones are added, and
             what a user added to its map.geojson stays.
@@ -133,10 +141,16 @@ def run(
     match_scans = odometry != "wheels"
     earlier, annotated = (None, None) if saved_map is None else _read_map(saved_map)
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
-    inputs, drives = [], []
+    robots = calibrated_logs.read_calibrations(calibration, log)
+    inputs: list[LogInput] = []
+    drives: list[RecordedDrive] = []
     for path, laser_log, known, file in zip(log, logs, references, verified, strict=True):
         with name_errors(str(path)):
             inputs.append(log_input.from_laser_log(laser_log, odometry))
+        if calibrate or calibration:
+            own = calibration[len(drives) % len(calibration)] if calibration else None
+            robot = robots[len(drives)]
+            calibrated_logs.check_calibration(path, laser_log, inputs[-1], own, robot)
         checked = None if file is None else relations_file.read(file)
         odom_poses = inputs[-1].odom_poses
         dead_reckoning: Metrics = {}
@@ -169,6 +183,11 @@ def run(
             size = f"{len(drive.log.times)} scans of {config.frontend.lidar.num_beams} beams"
             print(f"{drive.path}: {size}{drive.log.source}", flush=True)
         with stopwatch() as seconds:
+            drives, inputs, calibrations = calibrated_logs.calibrated(
+                drives, inputs, robots, out_dir, calibrate=calibrate
+            )
+            if calibrations:
+                given = log_input.combine(inputs)._replace(config=config)
             viewer = None
             if rerun is not None:
                 file = out_dir / "run.rrd" if rerun == "file" else None
@@ -193,6 +212,8 @@ def run(
             "odometry": given.odometry_source,
             "seconds": seconds,
         }
+        if calibrations:
+            extra["calibration"] = calibrations if len(drives) > 1 else calibrations[0]
         if folders:
             extra["other_parts"] = folders
         extra["mended"] += _left_from_before(out, folders, len(drives))

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from jaxslam.cli import summaries, tune_report
+from jaxslam.cli import calibrated_logs, summaries, tune_report
 from jaxslam.cli.log_options import Scanner, ScannerOptions
 from jaxslam.cli.options import (
     Files,
@@ -34,7 +34,7 @@ from jaxslam.evaluation import (
     summary,
 )
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.io import checkpoint, noise_file
+from jaxslam.io import calibration_file, checkpoint, noise_file
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors, tune_state
@@ -42,6 +42,7 @@ from jaxslam.tuning.losses import Loss
 from jaxslam.tuning.tune_state import TuneResult, TuneState
 
 PARAMS_FILE, CHECKPOINT_FILE = "noise.json", "tune.npz"
+CALIBRATION_FILE = "calibration.json"
 
 
 class _Settings(NamedTuple):
@@ -66,7 +67,9 @@ def tune(
     world: str = "office",
     trials: int = 32,
     heldout: int = 16,
-    loss: Literal["pose_nll", "pose_mse", "innovation_nll"] = "pose_nll",
+    loss: Literal[
+        "pose_nll", "pose_mse", "innovation_nll", "prediction_nll", "closure_nll"
+    ] = "pose_nll",
     updates: int = 30,
     batch: OptionalCount = None,
     patience: OptionalCount = None,
@@ -74,6 +77,7 @@ def tune(
         tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
     ] = (),
     noise: OptionalFile = None,
+    calibrate: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     scanner: Scanner = ScannerOptions(),  # noqa: B008
     seed: int = 0,
     out: OutFolder = Path("out"),
@@ -103,8 +107,10 @@ def tune(
         heldout: Number of simulated held-out trials, for evaluation only.
         loss: Loss to minimise. pose_nll: negative log density of the true pose, which needs both
             accuracy and a consistent covariance; pose_mse: squared pose error alone, which leaves
-            the scale of the noise undetermined; innovation_nll: negative log-likelihood of the
-            innovations, the only one that needs no reference.
+            the scale of the noise undetermined. The others need no reference. innovation_nll:
+            negative log-likelihood of the innovations, for white noise; prediction_nll: that of the
+            map of each part of 64 steps, predicted from all before; closure_nll: that of landmarks
+            seen again after more than 64 steps; both for errors of the sensor that last.
         updates: Updates of the optimiser: L-BFGS, or Adam with --batch.
         batch: Episodes (logs or trials) per update (minibatch); by default all.
         patience: Stop after this many evaluations without improvement; by default never.
@@ -112,6 +118,10 @@ def tune(
             odometry_coefficients[3], range_std, bearing_std, feature_std_scale, wall_angle_std,
             scan_match_std_scale.
         noise: File of the initial noise parameters (Q and R); by default cautious ones.
+        calibrate: Of laser logs of one robot: calibrate it first, its wheels, the scanner's mount
+            and the clocks of both, by scan matching against odometry, and write calibration.json,
+            which --calibration of `jaxslam run` reads. The noise is then that of the calibrated
+            robot.
         scanner: The scanner and the frames of laser logs.
         seed: Random seed of the simulation and of the order of the minibatches.
         out: Folder for the results.
@@ -137,8 +147,11 @@ def tune(
             match_scans=match_scans,
             loss=settings.loss,
             scanner=scanner,
+            calibrate=calibrate,
         )
     else:
+        if calibrate:
+            raise InputError("applies to laser logs only", field="--calibrate")
         if test or reference:
             raise InputError("apply to logs only", field="--test, --reference")
         check_range("--trials", trials, 1, 10**6)
@@ -150,10 +163,14 @@ def tune(
         enable_caches()
         with stopwatch() as seconds:
             job = task.load()
+            if job.robot is not None:
+                calibration_file.write(out_dir / CALIBRATION_FILE, job.robot)
             found = _tune(job, out, settings)
             with _resumable(out, lambda: "all evaluations"):
                 numbers, report = _evaluate(job, found, settings)
         numbers |= {"seconds": seconds}
+        if job.robot is not None:
+            numbers["calibration"] = calibrated_logs.metrics_of(job.robot)
         noise_file.write(out_dir / PARAMS_FILE, found.params)
         write_json(out_dir / "metrics.json", numbers)
         _draw_history(out_dir / "history.png", found)
@@ -268,13 +285,11 @@ def _evaluate(
         keys = map(noise_file.key_of, sure.names)
         numbers["standard_errors"] = dict(zip(keys, sure.relative.tolist(), strict=True))
         numbers["warnings"] = list(sure.warnings)
-    names, values = tune_report.numbers_of(found.params)
     report = tune_report.TuneReport(
         before=before,
         after=after,
-        names=names,
-        start=tune_report.numbers_of(job.params)[1],
-        found=values,
+        start=job.params,
+        found=found.params,
         frozen=~parameters.trainable_mask(found.params, settings.frozen),
         errors=sure,
     )

@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.cli import calibrated_logs
 from jaxslam.cli.log_options import ScannerOptions, read_params, require_odometry
 from jaxslam.cli.options import name_errors
 from jaxslam.core import time_series
 from jaxslam.core.episode import Episode
-from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import mrclam, tum
+from jaxslam.io.calibration_file import RobotCalibration
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
@@ -41,6 +42,7 @@ class TuneJob(NamedTuple):
         train: [B] episodes to tune on.
         test: [H] held-out episodes to evaluate on; None: evaluate on `train`.
         title: Title of the summary.
+        robot: Its calibration, if that was asked for.
     """
 
     config: Config
@@ -48,6 +50,7 @@ class TuneJob(NamedTuple):
     train: Episode
     test: Episode | None
     title: str
+    robot: RobotCalibration | None = None
 
 
 class TuneTask(NamedTuple):
@@ -72,6 +75,8 @@ class _LogFiles(NamedTuple):
         test: Likewise, held out.
         no_reference: Paths of logs without a reference.
         advice: Advice for these.
+        calibrate: Calibrates the robot of the logs, whose episodes then follow from it, which takes
+            its time; None if that was not asked for.
     """
 
     config: Config
@@ -80,6 +85,7 @@ class _LogFiles(NamedTuple):
     test: Sequence[Callable[[], Episode]]
     no_reference: Sequence[Path]
     advice: str
+    calibrate: Callable[[], RobotCalibration] | None = None
 
 
 def simulated_task(
@@ -122,6 +128,7 @@ def recorded_task(
     match_scans: bool,
     loss: Loss,
     scanner: ScannerOptions = ScannerOptions(),  # noqa: B008
+    calibrate: bool = False,
 ) -> TuneTask:
     """Read and check all files of a tuning on logs."""
     robots = {path: mrclam_robots(path) for path in (*logs, *test)}
@@ -130,6 +137,8 @@ def recorded_task(
     if None not in robots.values():
         if reference:
             raise InputError("MRCLAM data sets contain theirs", field="--reference")
+        if calibrate:
+            raise InputError("MRCLAM data sets have no scans", field="--calibrate")
         files = _read_mrclam(
             [robot for path in logs for robot in robots[path] or ()],
             [robot for path in test for robot in robots[path] or ()],
@@ -137,13 +146,20 @@ def recorded_task(
         )
     else:
         files = _read_laser_logs(
-            logs, test, reference, noise, match_scans=match_scans, scanner=scanner
+            logs,
+            test,
+            reference,
+            noise,
+            match_scans=match_scans,
+            scanner=scanner,
+            calibrate=calibrate,
         )
     if losses.needs_truth(loss) and files.no_reference:
         problem = f"has no reference, which the loss {losses.name_of(loss)} needs"
         raise InputError(problem, path=files.no_reference[0], advice=files.advice)
 
     def load() -> TuneJob:
+        robot = None if files.calibrate is None else files.calibrate()
         train = [make_episode() for make_episode in files.train]
         heldout = [make_episode() for make_episode in files.test]
         count = f"{len(train)} log{'s' if len(train) > 1 else ''}"
@@ -152,7 +168,7 @@ def recorded_task(
         width = max(episode.features.valid.shape[1] for episode in (*train, *heldout))
         train, heldout = ([_widened(x, width) for x in some] for some in (train, heldout))
         held_out = stack_episodes(heldout) if heldout else None
-        return TuneJob(files.config, files.params, stack_episodes(train), held_out, title)
+        return TuneJob(files.config, files.params, stack_episodes(train), held_out, title, robot)
 
     return TuneTask(files.params, load)
 
@@ -205,6 +221,7 @@ def _read_laser_logs(
     *,
     match_scans: bool,
     scanner: ScannerOptions,
+    calibrate: bool,
 ) -> _LogFiles:
     """Read laser logs of one scanner with their reference trajectories, if there are any."""
     params = read_params(noise, NoiseParams.for_laser_log(match_scans=match_scans))
@@ -231,11 +248,19 @@ def _read_laser_logs(
             advice = "compare their clocks, and the order of --reference"
             raise InputError("has no pose at the time of a scan", path=path, advice=advice)
 
-    def make_episode(path: Path, log: LaserLog, trajectory: Trajectory | None) -> Episode:
+    def make_episode(path: Path, number: int, trajectory: Trajectory | None) -> Episode:
         with name_errors(str(path)):
-            return episodes.episode_from_laser_log(config, log, trajectory, match_scans=match_scans)
+            return episodes.episode_from_laser_log(
+                config, logs[number], trajectory, match_scans=match_scans
+            )
 
-    given = zip(paths, logs, references or [None] * len(logs), strict=True)
+    def calibrate_logs() -> RobotCalibration:
+        robot, logs[:] = calibrated_logs.tune_calibration(paths, logs, len(train))
+        return robot
+
+    if calibrate:
+        calibrated_logs.check_same_robot(paths, logs)
+    given = zip(paths, range(len(logs)), references or [None] * len(logs), strict=True)
     makers = [partial(make_episode, *of_one) for of_one in given]
     return _LogFiles(
         config,
@@ -244,6 +269,7 @@ def _read_laser_logs(
         makers[len(train) :],
         [] if reference else train,
         "give --reference, or use --loss innovation_nll",
+        calibrate_logs if calibrate else None,
     )
 
 

@@ -1,13 +1,16 @@
 """The report that `jaxslam tune` ends with: its blocks of `metrics.json`, and `report.png`."""
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxslam.core.types import Metrics
 from jaxslam.evaluation import ConsistencyReport, report_metrics
 from jaxslam.io import noise_file
+from jaxslam.tuning import parameters, transforms
 from jaxslam.tuning.standard_errors import StandardErrors
 from jaxslam.tuning.tune_state import TuneResult
 
@@ -42,18 +45,16 @@ class TuneReport(NamedTuple):
         before: Consistency of the filter before, on the episodes that it is evaluated on; None if
             no feature updated it.
         after: Consistency after.
-        names: (P,) keys of the parameters, one for each number.
-        start: (P,) the parameters before.
-        found: (P,) the parameters after.
+        start: The parameters before.
+        found: The parameters after, with the same tree.
         frozen: (P,) bool, not tuned.
         errors: Standard errors; None with fewer than two episodes.
     """
 
     before: ConsistencyReport | None
     after: ConsistencyReport | None
-    names: tuple[str, ...]
-    start: np.ndarray
-    found: np.ndarray
+    start: Any
+    found: Any
     frozen: np.ndarray
     errors: StandardErrors | None
 
@@ -64,7 +65,7 @@ def report_blocks(report: TuneReport) -> Metrics:
         when: None if found is None else report_metrics(found)
         for when, found in (("before", report.before), ("after", report.after))
     }
-    estimates = _estimates(report)
+    estimates = estimates_of(report)
     parameters = {
         each.name: {
             "before": each.before,
@@ -81,24 +82,49 @@ def report_blocks(report: TuneReport) -> Metrics:
     return {"consistency": consistency, "parameters": parameters, "correlations": correlations}
 
 
-def _estimates(report: TuneReport) -> "list[Estimate]":
-    """The parameters as `viz.parameter_charts` takes them."""
+def estimates_of(report: TuneReport) -> "list[Estimate]":
+    """All P parameters, as `viz.parameter_charts` takes them.
+
+    Positive ones have standard errors of their logarithms. The elements of a matrix are those of
+    its unconstrained Cholesky factor.
+    """
     from jaxslam.viz.parameter_charts import Estimate  # here, because matplotlib is slow to import
 
-    errors, size = report.errors, len(report.names)
-    relative = np.full(size, np.nan) if errors is None else errors.relative
-    sure = np.ones(size, bool) if errors is None else errors.identifiable | report.frozen
+    names, errors = parameters.param_names(report.found), report.errors
+    theta = [parameters.flatten_params(each) for each in (report.start, report.found)]
+    values, std_errors = [np.array(x) for x in theta], np.full(len(names), np.nan)
+    positive = np.zeros(len(names), bool)
+    if errors is not None:
+        std_errors = np.array(errors.relative)
+    first = 0
+    leaves = [jax.tree.leaves(tree) for tree in (report.start, report.found)]
+    own_errors = [] if errors is None else jax.tree.leaves(errors.of_params)
+    for k, transform in enumerate(transforms.of_leaves(report.found)):
+        shape = np.shape(leaves[1][k])
+        is_factor = transform.forward is transforms.CHOLESKY.forward
+        count = shape[0] * (shape[0] + 1) // 2 if is_factor else math.prod(shape)
+        own = slice(first, first + count)
+        first += count
+        if is_factor:
+            continue
+        for value, tree in zip(values, leaves, strict=True):
+            value[own] = np.ravel(np.asarray(tree[k], np.float64))
+        positive[own] = transform.forward is transforms.POSITIVE.forward
+        if own_errors and not positive[own].all():
+            std_errors[own] = np.ravel(np.asarray(own_errors[k], np.float64))
+    sure = np.ones(len(names), bool) if errors is None else errors.identifiable | report.frozen
     return [
         Estimate(
-            name=name,
-            before=float(report.start[k]),
-            after=float(report.found[k]),
-            std_error=float(relative[k]),
+            name=noise_file.key_of(name),
+            before=float(values[0][k]),
+            after=float(values[1][k]),
+            std_error=float(std_errors[k]),
+            positive=bool(positive[k]),
             frozen=bool(report.frozen[k]),
             identifiable=bool(sure[k]),
-            unit=UNITS.get(name, ""),
+            unit=UNITS.get(noise_file.key_of(name), ""),
         )
-        for k, name in enumerate(report.names)
+        for k, name in enumerate(names)
     ]
 
 
@@ -127,27 +153,17 @@ def draw_report(
     before = numbers["before"]
     rows = [(name, before.get(key), numbers.get(key)) for key, name in ERRORS]
     page = TuningPage(
-        title=title,
+        title=f"Tuning of Q and R: {title}",
         subtitle=f"{numbers['evaluations']} evaluations; evaluated on {numbers['judged_on']}",
         before=report.before,
         after=report.after,
-        estimates=_estimates(report),
+        estimates=estimates_of(report),
         correlation=correlation_of(report),
         training=found.loss,
         heldout=found.heldout,
         best=found.best,
         errors=[row for row in rows if row[1] is not None and row[2] is not None],
         notes=numbers["warnings"],
+        series="corrections of the pose by the features",
     )
     canvas.save(tuning_page(page), path)
-
-
-def numbers_of(params: NamedTuple) -> tuple[tuple[str, ...], np.ndarray]:
-    """Keys (P,) and values (P,) float64 of all numbers of noise parameters."""
-    names, values = [], []
-    for key, value in noise_file.to_keys(params).items():
-        if value is not None:
-            array = np.asarray(value, np.float64)
-            names += [key] if array.ndim == 0 else [f"{key}[{i}]" for i in range(array.size)]
-            values += array.ravel().tolist()
-    return tuple(names), np.array(values)

@@ -150,12 +150,25 @@ def _shift(odometry: Any, times: Any, offset: Any) -> Any:
     begin, end = times[after - 1], times[after]
     apart = end > begin
     fraction = xp.where(apart, (wanted - begin) / xp.where(apart, end - begin, 1.0), 0.0)
-    reckon = se2_np.dead_reckoning if xp is np else se2.dead_reckoning
-    poses = reckon(xp.zeros(3, dtype=odometry.dtype), odometry)
+    poses = reckon(odometry)
     inside = _part(odometry[after], fraction.astype(odometry.dtype))
     shifted = _compose(poses[after - 1], inside)
     moved = _relative(shifted[:-1], shifted[1:])
     return xp.concat([xp.zeros((1, 3), dtype=odometry.dtype), moved])
+
+
+def reckon(increments: Any) -> Any:
+    """`se2.dead_reckoning` (T, 3) from the origin in either namespace; in NumPy by sums, for speed.
+
+    Args:
+        increments: (T, 3) [m, m, rad].
+    """
+    xp = increments.__array_namespace__()
+    if xp is not np:  # sums of T numbers take long to compile
+        return se2.dead_reckoning(xp.zeros_like(increments[0]), increments)
+    heading = xp.cumsum(increments[:, 2])
+    moved = _rotate(increments[:, :2], heading - increments[:, 2])
+    return xp.concat([xp.cumsum(moved, axis=0), heading[:, None]], axis=1)
 
 
 def _part(increments: Any, fraction: Any) -> Any:

@@ -25,6 +25,8 @@ class Features(NamedTuple):
         certified: (M,) bool, all of the circle of a junction was seen.
         trusted: (M,) bool, may start a new landmark; the others are only matched with known ones.
         valid: (M,) bool, False marks padding.
+        incidence: (M,) [rad] largest angle between a beam and the normal of the wall that it meets,
+            at the middle of what is seen of each wall of the feature, 0 to pi / 2; None: not known.
     """
 
     kind: Array
@@ -37,6 +39,7 @@ class Features(NamedTuple):
     certified: Array
     trusted: Array
     valid: Array
+    incidence: Array | None = None
 
 
 def zero_padding(features: Features) -> Features:
@@ -58,7 +61,7 @@ def restrict_features(features: Features, wanted: Array) -> Features:
         features.direction_variance,
         features.descriptor,
     )
-    for x in numbers:
+    for x in numbers if features.incidence is None else (*numbers, features.incidence):
         wanted &= jnp.all(jnp.isfinite(x.reshape(x.shape[0], -1)), axis=1)
     return zero_padding(features._replace(valid=features.valid & wanted))
 

@@ -38,6 +38,7 @@ class LaserLog(NamedTuple):
             trusted: it was lost or interpolated; None if all are to be.
         mount: (3,) [m, m, rad] pose of the scanner in the robot frame (`base_link`), as far as it
             is known; the identity if not.
+        frames: Names of the robot's frame and of the scanner's, as far as the log has them.
     """
 
     times: np.ndarray
@@ -52,6 +53,7 @@ class LaserLog(NamedTuple):
     has_odometry: bool = True
     odometry_guessed: np.ndarray | None = None
     mount: np.ndarray = np.zeros(3)
+    frames: tuple[str, str] = ("", "")
 
     @classmethod
     def from_arrays(

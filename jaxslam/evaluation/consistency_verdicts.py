@@ -80,6 +80,8 @@ def verdicts_of(
 def _mean_text(name: str, fit: ChiSquareFit) -> str:
     """Mean per degree of freedom, with half of its 95 % interval and as many digits as that has."""
     half = NORMAL_QUANTILE * fit.std_error
+    if not np.isfinite(half):
+        return f"{name} per dof {fit.per_dof:.2f} (1 expected, of a single step)"
     digits = int(np.clip(-np.floor(np.log10(half)), 2, 4)) if half > 0.0 else 2
     return f"{name} per dof {fit.per_dof:.{digits}f} (1 expected, +- {half:.{digits}f})"
 
@@ -130,11 +132,16 @@ def _correlation_text(white: Whiteness) -> tuple[str, str]:
     band = abs(2.0 * mean / score)
     lags = "lag 1" if last == 1 else f"lags 1 to {last}, mean"
     slightly = "slightly " if abs(mean) < SLIGHT else ""
-    return slightly, f"at {lags}: {white.names[k]} {mean:+.2f} (0 expected, +- {band:.2f})"
+    name = f" {white.names[k]}" if len(white.names) > 1 else ""
+    return slightly, f"at {lags}:{name} {mean:+.2f} (0 expected, +- {band:.2f})"
 
 
-def _cause(size: int, sign: int, per_dof: float) -> str:
-    return CAUSES[size, sign].format(factor=per_dof, inverse=1.0 / max(per_dof, 1e-12))
+def _cause(white: Whiteness, size: int, sign: int, per_dof: float) -> str:
+    """Likely cause; a slight correlation does not say how much both Q and R are off."""
+    text = CAUSES[size, sign].format(factor=per_dof, inverse=1.0 / max(per_dof, 1e-12))
+    if size and sign and abs(_correlation(white).mean) < SLIGHT:
+        return f"{text}, perhaps {'Q' if text.startswith('R') else 'R'}, too"
+    return text
 
 
 def _nis_lines(
@@ -144,14 +151,14 @@ def _nis_lines(
     if abs(nis.score) < SIGNIFICANT:
         return []
     text, part = _mean_text("NIS", nis), _bias_part(nis, white, biased)
-    if part > 0.5 * max(nis.per_dof - 1.0, 0.0) and size <= 0:
+    if nis.per_dof > 1.0 and size <= 0 and part > 0.5 * (nis.per_dof - 1.0):
         return [f"innovations too large by their bias: {text}, {part:.2f} of it the bias"]
     slightly = "slightly " if abs(nis.per_dof - 1.0) < SLIGHT else ""
     which = "large" if nis.per_dof > 1.0 else "small"
     if white is None:
         cause = "Q or R too small" if nis.per_dof > 1.0 else "Q or R too large"
     else:
-        cause = _cause(size, sign, nis.per_dof - part)
+        cause = _cause(white, size, sign, nis.per_dof - part)
     return [f"{cause}: innovations are {slightly}too {which}, {text}"]
 
 
@@ -205,11 +212,16 @@ def _shape_lines(fit: ChiSquareFit, name: str) -> list[str]:
 
 
 def _time_lines(white: Whiteness | None, nis_white: Whiteness) -> list[str]:
-    """Noise whose size varies in time: large innovations follow large ones."""
-    if nis_white.ljung_box_p >= P_VALUE or not _sign(nis_white) > 0:
+    """Noise whose size varies in time: large innovations follow large ones.
+
+    Innovations with the correlation r have squares with r^2, which is no finding of its own.
+    """
+    if nis_white.ljung_box_p >= P_VALUE or _sign(nis_white) <= 0:
         return []
     if white is not None and (_sign(white) or white.ljung_box_p < P_VALUE):
-        return []  # innovations that are correlated have squares that are
+        excess = nis_white.autocorrelation[0, 1] - np.nanmax(white.autocorrelation[:, 1] ** 2)
+        if not excess > max(SLIGHT, SIGNIFICANT / np.sqrt(nis_white.num_pairs[0, 1])):
+            return []
     slightly, where = _correlation_text(nis_white)
     cause = "noise that varies in time, or correlated innovations"
     return [f"NIS is {slightly}correlated {where}; {cause}"]

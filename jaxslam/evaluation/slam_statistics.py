@@ -6,7 +6,7 @@ pose. As the innovations of a filter that is right are white, so are the correct
 
     cov d = K S K^T = P_predicted - P_updated
 
-which the diagnostics of the filter contain: no other program runs, and none of its outputs changes.
+so a program of its own runs the filter and keeps both poses; its results are those of the filter.
 The corrections are taken in the frame of the robot and whitened in the order heading, left, ahead:
 d = L w with L lower triangular. Directions that a step does not correct have no value.
 """
@@ -17,18 +17,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode, measurements_of
+from jaxslam.core.measurement import Measurement
 from jaxslam.core.se2 import rotation, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, nees, pose_error
 from jaxslam.evaluation.filter_consistency import ConsistencyReport, consistency_of_nis
-from jaxslam.filtering import ekf, slam_filter
+from jaxslam.filtering import slam_filter
 from jaxslam.filtering.belief import Belief
-from jaxslam.filtering.config import FilterConfig, init
-from jaxslam.filtering.noise import NoiseParams, motion_estimate
-from jaxslam.filtering.slam_filter import StepInfo
+from jaxslam.filtering.config import FilterConfig, check_options, init
+from jaxslam.filtering.inputs import check_inputs
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.filtering.step_info import StepInfo
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, check_drives, trial_result
 
@@ -79,49 +82,35 @@ def _filter(
 ) -> tuple[TrialResult, FilterStatistics]:
     """Result and statistics of one drive."""
     start = init(config, episode.truth[0])
-    belief, info = slam_filter.run_filter(config, params, start, measurements_of(episode))
-    correction, corrected = pose_corrections(config, params, start, episode, info)
+    params, measurements = check_inputs(params, start, measurements_of(episode), over_time=True)
+    check_options(config, params, start)
+
+    def body(belief: Belief, now: Measurement) -> tuple[Belief, tuple[StepInfo, Array, Array]]:
+        predicted, _ = slam_filter.predict(config, params, belief, now)  # the same as in the step
+        belief, info = slam_filter.unchecked_step(config, params, belief, now)
+        return belief, (info, *pose_correction(predicted, info))
+
+    belief, (info, correction, corrected) = lax.scan(body, start, measurements)
     statistics = FilterStatistics(info.nis, info.dof, correction, corrected)
     return trial_result(config, episode, belief, info), statistics
 
 
-def pose_corrections(
-    config: FilterConfig, params: NoiseParams, start: Belief, episode: Episode, info: StepInfo
-) -> tuple[Array, Array]:
-    """Whitened corrections of the pose by the features of each step; module's docstring.
+def pose_correction(predicted: Belief, info: StepInfo) -> tuple[Array, Array]:
+    """Whitened correction of the pose by the features of a step; module's docstring.
 
     Args:
-        config: Of the filter.
-        params: Its Q and R.
-        start: Belief before the first step.
-        episode: One drive of T steps.
-        info: [T] diagnostics of the filter on it.
+        predicted: Belief of the step after the odometry, before the features.
+        info: Diagnostics of the step.
 
     Returns:
-        Corrections (T, 3), components as `CORRECTIONS`, 0 where there is none; and bool (T, 3)
+        The correction (3,), components as `CORRECTIONS`, 0 where there is none; and bool (3,)
         where there is one.
     """
-    increments, Q = jax.vmap(partial(motion_estimate, params))(measurements_of(episode))
-
-    def predict(first: Array, pose: Array, cov: Array, increment: Array, Q: Array) -> Belief:
-        before = start._replace(
-            mean=start.mean.at[:3].set(pose),
-            first_estimate=start.first_estimate.at[:3].set(first),
-            pose_cov=cov,
-        )
-        return ekf.predict(before, increment, Q, linearisation=config.linearisation)
-
-    poses = jnp.concatenate([start.pose[None], info.pose[:-1]])
-    covs = jnp.concatenate([start.pose_cov[None], info.pose_cov[:-1]])
-    predicted = jax.vmap(predict)(poses, poses, covs, increments, Q).pose
-    # With "first_estimates" a displacement counts from the pose as the step before predicted it.
-    firsts = jnp.concatenate([start.first_estimate[None, :3], predicted[:-1]])
-    predicted_cov = jax.vmap(predict)(firsts, poses, covs, increments, Q).pose_cov
-
-    shift = info.pose - predicted
-    shift = shift.at[:, 2].set(wrap_angle(shift[:, 2]))
-    w, has = jax.vmap(_whiten)(shift, predicted_cov, predicted_cov - info.pose_cov, predicted[:, 2])
-    has &= (info.finite & (info.dof > 0))[:, None]
+    shift = info.pose - predicted.pose
+    shift = shift.at[2].set(wrap_angle(shift[2]))
+    taken = predicted.pose_cov - info.pose_cov
+    w, has = _whiten(shift, predicted.pose_cov, taken, predicted.pose[2])
+    has &= info.finite & (info.dof > 0)
     return jnp.where(has, w, 0.0), has
 
 

@@ -1,5 +1,6 @@
 """EKF-SLAM with junctions, corners and wall directions as landmarks; see README.md here."""
 
+from jaxslam.filtering.adaptation import AdaptationSpec as AdaptationSpec
 from jaxslam.filtering.belief import Belief as Belief
 from jaxslam.filtering.belief import add_known_landmarks as add_known_landmarks
 from jaxslam.filtering.belief import grow_belief as grow_belief
@@ -7,13 +8,17 @@ from jaxslam.filtering.config import FilterConfig as FilterConfig
 from jaxslam.filtering.config import check_config as check_config
 from jaxslam.filtering.config import confirmed as confirmed
 from jaxslam.filtering.config import init as init
+from jaxslam.filtering.config import with_options as with_options
 from jaxslam.filtering.covariance import DeferredCovariance as DeferredCovariance
 from jaxslam.filtering.covariance import defer as defer
 from jaxslam.filtering.covariance import flush as flush
 from jaxslam.filtering.data_association import AssociationSpec as AssociationSpec
 from jaxslam.filtering.ekf import LINEARISATIONS as LINEARISATIONS
+from jaxslam.filtering.heteroscedastic import MeasurementWeights as MeasurementWeights
+from jaxslam.filtering.heteroscedastic import OdometryWeights as OdometryWeights
 from jaxslam.filtering.inputs import check_params as check_params
 from jaxslam.filtering.noise import NoiseParams as NoiseParams
+from jaxslam.filtering.noise_model import NoiseModel as NoiseModel
 from jaxslam.filtering.slam_filter import StepInfo as StepInfo
 from jaxslam.filtering.slam_filter import run_filter as run_filter
 from jaxslam.filtering.slam_filter import step as step

@@ -35,8 +35,8 @@ class MeasurementWeights(NamedTuple):
     Attributes:
         range: [1 / m] of the distance to a point; 0 for a wall.
         incidence: [1 / rad] of the largest angle between the beam and the normals of the walls of
-            a feature, 0 to pi / 2: of the two walls of a corner; 0 for other kinds, whose walls
-            `Features` does not hold.
+            a feature, 0 to pi / 2: `Features.incidence`, or that of a corner, and 0 for other
+            kinds, where the front end does not state it (`incidence`).
         turn: [1 / rad] of the angle by which the robot turned since the step before.
         clearance: [1 / m] of the clearance of a junction; 0 for other kinds.
         unexplained: [-] of the fraction of the scan's points that scan matching does not explain;
@@ -70,15 +70,18 @@ class OdometryWeights(NamedTuple):
 
 
 WEIGHTS = {"odometry_weights": OdometryWeights, "measurement_weights": MeasurementWeights}
-"""Records of weights by the fields of `NoiseParams` that hold them."""
+"""Types of weights by the fields of `NoiseParams` that hold them."""
 
 
 def incidence(features: Features) -> Array:
     """Largest angle (M,) [rad] between the beam to a feature and the normals of its walls.
 
-    A corner's walls leave it at its direction plus and minus half the angle of its free side. The
-    sine of the angle between beam and wall is the cosine of the incidence. 0 for other kinds.
+    That of the front end, if `FeatureSpec.incidence` is on. Otherwise that of corners, and 0 for
+    other kinds: a corner's walls leave it at its direction plus and minus half the angle of its
+    free side, and the sine of the angle between beam and wall is the cosine of the incidence.
     """
+    if features.incidence is not None:
+        return jnp.where(features.valid, features.incidence, 0.0)
     bearing = jax.vmap(range_bearing)(features.xy)[:, 1]
     half = features.descriptor / 2
     walls = jnp.stack([features.direction - half, features.direction + half])

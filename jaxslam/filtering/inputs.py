@@ -26,6 +26,7 @@ FLOATS: dict[str, tuple[int, ...]] = {
     "direction": (),
     "direction_variance": (),
     "descriptor": (),
+    "incidence": (),
 }
 # The other fields of `Features`, with the kind of numbers they accept and their type.
 OTHERS = {
@@ -181,12 +182,14 @@ def as_features(name: str, features: Features, lead: tuple[int, ...], dtype: Any
     if not kind.shape[-1]:
         raise ValueError(f"{name} holds no feature, M = 0; give one with valid = False")
 
-    def convert(field: str, value: Any) -> Array:
+    def convert(field: str, value: Any) -> Array | None:
+        if value is None and field == "incidence":
+            return None
         if field in FLOATS:
             return _floats(f"{name}.{field}", value, kind.shape + FLOATS[field], dtype)
         return _as_type(f"{name}.{field}", value, kind.shape, *OTHERS[field])
 
-    return Features(*(convert(field, value) for field, value in features._asdict().items()))
+    return Features._make(convert(field, value) for field, value in features._asdict().items())
 
 
 def as_scan_match(name: str, scan_match: ScanMatch, lead: tuple[int, ...], dtype: Any) -> ScanMatch:

@@ -22,9 +22,10 @@ What S_ii / w_i exceeds S_ii by is noise of the measurement, where w_i is below 
 
 so that the robot follows an innovation far off by a share w_i of the gain. To divide R_i alone by
 w_i would not do: where the pose is uncertain R_i is small beside S_ii, and a wrong landmark would
-be followed all the same. What is near is not trusted more. Approximated are: the sum of a Gaussian and a Student t distribution, by one t of both scales;
-the innovations of a scan, as uncorrelated rather than of one common heavy tail; the posterior, by a
-Gaussian of one iteration. Data association, and the test of matches, are Gaussian as before.
+be followed all the same. What is near is not trusted more. Approximated are: the sum of a Gaussian
+and a Student t distribution, by one t of both scales; the innovations of a scan, as uncorrelated
+rather than of one common heavy tail; the posterior, by a Gaussian of one iteration. Data
+association, and the test of matches, are Gaussian as before.
 
 References:
     Lange, Little, Taylor (1989), Robust statistical modeling using the t distribution. Roth,

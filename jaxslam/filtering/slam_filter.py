@@ -90,7 +90,7 @@ def unchecked_step(
     features, features_cov = _select(config, params, measurement)
     if belief.adaptation is not None:
         features_cov *= jnp.exp(belief.adaptation.log_variance[1])
-    predicted, odometry_cov = _predict(config, params, belief, measurement)
+    predicted, odometry_cov = predict(config, params, belief, measurement)
     found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
     matches = _choose(config, predicted, features, found.slot)
     chosen, rows = _linearise(config, predicted, features, features_cov, matches)
@@ -135,10 +135,10 @@ def _select(
     )
 
 
-def _predict(
+def predict(
     config: FilterConfig, params: NoiseParams, belief: Belief, measurement: Measurement
 ) -> tuple[Belief, Array]:
-    """Predict by the odometry increment, and count the step.
+    """Predict by the odometry increment, and count the step: what `unchecked_step` begins with.
 
     Returns:
         The belief, and the covariance Q (3, 3) of the increment in the frame of the pose before it.

@@ -35,6 +35,7 @@ class FeatureSpec(NamedTuple):
             deviations of it.
         max_coarse_candidates: Number of cells of each coarser level of the pyramid at which
             junctions are searched.
+        incidence: Whether features hold the angle of incidence, for noise that depends on it.
     """
 
     max_junctions: int = 8
@@ -52,6 +53,7 @@ class FeatureSpec(NamedTuple):
     min_corner_angle: float = 0.6
     tangency_gate: float = 1.5
     max_coarse_candidates: int = 8
+    incidence: bool = False
 
     @property
     def num_candidates(self) -> int:
@@ -108,6 +110,10 @@ def find_corners(spec: FeatureSpec, segments: Segments) -> Features:
     rank = jnp.where(good, trace - trusted.astype(trace.dtype), jnp.inf)
     order = jnp.argsort(rank, stable=True)[: spec.max_corners]
     inward = jnp.arctan2(segments.normal[:, 1], segments.normal[:, 0]) + 0.5 * turn
+    angle = None
+    if spec.incidence:
+        own = segments.incidence
+        angle = jnp.maximum(own, jnp.roll(own, -1))[order]
     zero = jnp.zeros(spec.max_corners, xy.dtype)
     return zero_padding(
         Features(
@@ -121,6 +127,7 @@ def find_corners(spec: FeatureSpec, segments: Segments) -> Features:
             certified=jnp.ones(spec.max_corners, bool),
             trusted=trusted[order],
             valid=good[order],
+            incidence=angle,
         )
     )
 
@@ -144,16 +151,17 @@ def find_wall_directions(spec: FeatureSpec, segments: Segments) -> Features:
     precision = 1.0 / segments.angle_variance
     length = jnp.where(long, segments.length, 0.0)
 
-    def next_group(left: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
+    def next_group(left: Array, _: None) -> tuple[Array, tuple[Array, Array, Array, Array | None]]:
         longest = jnp.argmax(left)
         difference = wrap_direction(angle - angle[longest])
         member = (left > 0.0) & (jnp.abs(difference) < 0.1)
         w = jnp.where(member, precision, 0.0)
         total = jnp.maximum(jnp.sum(w), 1e-6)
         mean = wrap_direction(angle[longest] + jnp.sum(w * difference) / total)
-        return jnp.where(member, 0.0, left), (mean, 1.0 / total, left[longest] > 0.0)
+        own = segments.incidence[longest] if spec.incidence else None
+        return jnp.where(member, 0.0, left), (mean, 1.0 / total, left[longest] > 0.0, own)
 
-    _, (direction, variance, valid) = lax.scan(next_group, length, length=spec.max_walls)
+    _, (direction, variance, valid, own) = lax.scan(next_group, length, length=spec.max_walls)
     return zero_padding(
         Features(
             kind=jnp.full(spec.max_walls, WALL, jnp.int32),
@@ -166,6 +174,7 @@ def find_wall_directions(spec: FeatureSpec, segments: Segments) -> Features:
             certified=jnp.ones(spec.max_walls, bool),
             trusted=valid,
             valid=valid,
+            incidence=own,
         )
     )
 

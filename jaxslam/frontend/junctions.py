@@ -141,6 +141,10 @@ def find_junctions(
     best, good = best_apart(score, circle.centre, spec.min_separation, spec.max_junctions)
     zero = jnp.zeros(spec.max_junctions, dtype)
     far = good & jnp.asarray(of_level > 0)[best]
+    angle = None
+    if spec.incidence:  # of the walls (K, C) that the circles touch
+        own = jnp.where(circle.touched, segments.incidence[:, None], 0.0)
+        angle = jnp.max(own, axis=0)[best]
     return zero_padding(
         Features(
             kind=jnp.where(far, jnp.int32(FAR_JUNCTION), jnp.int32(JUNCTION)),
@@ -153,5 +157,6 @@ def find_junctions(
             certified=certified[best],
             trusted=trusted[best],
             valid=good,
+            incidence=angle,
         )
     )

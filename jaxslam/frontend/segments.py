@@ -59,6 +59,13 @@ class Segments(NamedTuple):
         """Length (K,) [m]."""
         return dot(self.ends[:, 1] - self.ends[:, 0], self.tangent)
 
+    @property
+    def incidence(self) -> Array:
+        """Angle (K,) [rad] between the beam to the centre and the normal, 0 to pi / 2."""
+        distance = jnp.sqrt(jnp.maximum(dot(self.centre, self.centre), 1e-12))
+        cosine = jnp.abs(dot(self.centre, self.normal)) / distance
+        return jnp.arccos(jnp.minimum(cosine, 1.0))
+
     def line_variance(self, along: Array) -> Array:
         """Variance (..., K) [m^2] across the line, `along` (..., K) [m] from the centre."""
         return self.offset_variance + along**2 * self.angle_variance

@@ -139,8 +139,9 @@ def read(path: str | PathLike, template: Noise) -> Noise:
     dtype = np.asarray(next(x for x in expected.values() if x is not None)).dtype
     options = {key: np.zeros(shape, dtype) for key, shape in OPTIONAL.items()}
     options = {key: like for key, like in options.items() if _holds(template, key)}
-    for key in numbers.keys() - expected.keys() - options.keys():
-        advice = f"the fields are {', '.join([*expected, *(options.keys() - expected.keys())])}"
+    for key in sorted(numbers.keys() - expected.keys() - options.keys()):
+        others = {own.partition(".")[0]: None for own in options if own not in expected}
+        advice = f"the fields are {', '.join([*expected, *others])}"
         raise InputError("unknown field", path=path, field=key, advice=advice)
     for key, like in expected.items():
         if like is not None and key not in numbers:

@@ -17,6 +17,12 @@ from jaxslam.tuning.model import run_model as run_model
 from jaxslam.tuning.optimizers import default_optimizer as default_optimizer
 from jaxslam.tuning.optimizers import lbfgs_backtracking as lbfgs_backtracking
 from jaxslam.tuning.parameters import param_names as param_names
+from jaxslam.tuning.prediction import ClosureNll as ClosureNll
+from jaxslam.tuning.prediction import NisConsistency as NisConsistency
+from jaxslam.tuning.prediction import PredictionNll as PredictionNll
+from jaxslam.tuning.prediction import closure_nll as closure_nll
+from jaxslam.tuning.prediction import nis_consistency as nis_consistency
+from jaxslam.tuning.prediction import prediction_nll as prediction_nll
 from jaxslam.tuning.priors import Prior as Prior
 from jaxslam.tuning.slam_model import slam_model as slam_model
 from jaxslam.tuning.standard_errors import StandardErrors as StandardErrors

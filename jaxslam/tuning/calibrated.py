@@ -29,6 +29,7 @@ from jaxslam.filtering.config import init as initial_belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.episodes import EPISODE_BATCH
 from jaxslam.tuning.model import Model
 from jaxslam.tuning.priors import Prior
 from jaxslam.tuning.slam_model import SlamCheck
@@ -166,4 +167,5 @@ def _model(config: Config, scan_period: float | None, wheel_base: float) -> Mode
     """`calibrated_slam_model`, the same object for the same arguments."""
     own = config.filter
     functions = _Init(own), _Step(own), _Inputs(scan_period, wheel_base), _Check(SlamCheck(own))
-    return Model(*cast(Any, functions))  # mypy does not see that a NamedTuple can be called
+    # mypy does not see that a NamedTuple can be called.
+    return Model(*cast(Any, functions))._replace(batch_size=EPISODE_BATCH)

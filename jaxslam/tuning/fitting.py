@@ -12,7 +12,7 @@ and are not tuned here.
 """
 
 from collections.abc import Callable, Collection
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,12 +22,14 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxslam.core.devices import DeviceMap
+from jaxslam.core.episode import Episode
 from jaxslam.core.types import Array, as_count
 from jaxslam.pipeline.config import Config
 from jaxslam.tuning import parameters
 from jaxslam.tuning.inputs import check_alike
 from jaxslam.tuning.losses import Loss, check_loss, default_loss, model_for, resolve
 from jaxslam.tuning.model import Model, num_steps, run_model
+from jaxslam.tuning.model_checks import check_model
 from jaxslam.tuning.optimizers import default_optimizer
 from jaxslam.tuning.parameters import constrain, trainable_mask, unconstrain, unflatten_params
 from jaxslam.tuning.priors import FlatPrior, flatten_prior
@@ -38,8 +40,6 @@ from jaxslam.tuning.tune_state import TuneState as TuneState
 from jaxslam.tuning.tune_state import check_state, record, stalled
 from jaxslam.tuning.tune_state import init as init
 from jaxslam.tuning.tune_state import result as result
-
-SEQUENCE_BATCH = 4  # sequences that a device differentiates together; bounds memory
 
 Transforms = tuple[Transform, ...]
 
@@ -83,12 +83,15 @@ def prepare(
     """
     model = as_model(model)
     if name is None:
-        name = "episodes" if isinstance(model.check, SlamCheck) else "data"
+        is_slam = isinstance(model.check, SlamCheck) or isinstance(data, Episode)
+        name = "episodes" if is_slam else "data"
     params, stacked = model.check(params, data, name)
     used = of_leaves(params, transforms)
     arrays = parameters.as_params(params, transforms)
+    if not isinstance(stacked, Episode):  # the filter's functions fit, and take long to trace
+        check_model(model, arrays, jax.tree.map(lambda x: x[0], stacked))
     function = default_loss(stacked) if loss is None else resolve(loss)
-    check_loss(function, stacked, name=name, model=model)
+    check_loss(function, stacked, name=name)
     return Problem(model_for(function, model), function, used, arrays, stacked)
 
 
@@ -107,8 +110,17 @@ def _value_and_gradient(
     return value, ravel_pytree(gradient)[0]
 
 
-_VALUES = DeviceMap(_value, size=SEQUENCE_BATCH, static=3)
-_GRADIENTS = DeviceMap(_value_and_gradient, size=SEQUENCE_BATCH, static=3)
+@cache
+def _over_devices(function: Callable[..., Any], batch_size: int) -> DeviceMap:
+    """A function of one sequence over many; the same object for the same arguments."""
+    return DeviceMap(function, size=batch_size, static=3)
+
+
+def _evaluate(function: Callable[..., Any], problem: Problem) -> Any:
+    """`_value` or `_value_and_gradient` of all sequences of a problem."""
+    model, loss, transforms, params, data = problem
+    run = _over_devices(function, model.batch_size)
+    return run(model, loss, transforms, unconstrain(params, transforms), data)
 
 
 def values(
@@ -129,9 +141,7 @@ def values(
 
 def values_of(problem: Problem) -> np.ndarray:
     """`values` of a problem that is checked."""
-    model, loss, transforms, params, data = problem
-    theta = unconstrain(params, transforms)
-    return np.asarray(_VALUES(model, loss, transforms, theta, data), np.float64)
+    return np.asarray(_evaluate(_value, problem), np.float64)
 
 
 def gradients(
@@ -152,9 +162,7 @@ def gradients(
 
 def gradients_of(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """`gradients` of a problem that is checked."""
-    model, loss, transforms, params, data = problem
-    theta = unconstrain(params, transforms)
-    value, gradient = _GRADIENTS(model, loss, transforms, theta, data)
+    value, gradient = _evaluate(_value_and_gradient, problem)
     return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
 
 
@@ -255,6 +263,8 @@ def tune(
     model, used_loss, used, params, training = problem
     validation = None
     if heldout is not None:
+        if not isinstance(training, Episode):
+            check_alike(training, heldout)
         checked = prepare(model, params, heldout, used_loss, transforms=transforms, name="heldout")
         validation = checked.data
         check_alike(training, validation)

@@ -73,6 +73,8 @@ def as_episodes(episodes: Episode | list[Episode], *, name: str = "episodes") ->
         raise ValueError(f"{name}.features holds no feature, M = 0; give one with valid = False")
 
     def feature(field: str, x: Any) -> Any:
+        if x is None and field == "incidence":
+            return None
         shape = (b, t, m, *FLOATS.get(field, ()))
         family = jnp.floating if field in FLOATS else OTHERS[field][0]
         return _convert(f"{name}.features.{field}", x, shape, family)

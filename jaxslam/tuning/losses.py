@@ -1,7 +1,8 @@
 """Losses for tuning Q and R by gradient: each is evaluated on one episode.
 
 A loss takes the step infos [T] of the filter and the episode that it ran on, and returns a number
-(). `fitting.tune` takes any function that does so; these are the usual ones. All are minimised.
+(). `fitting.tune` takes any function that does so; these are the usual ones, and those of
+`prediction`, which run the filter a second time. All are minimised.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +23,6 @@ from jaxslam.tuning.prediction import (
     Comparison,
     Memories,
     closure_nll,
-    nis_consistency,
     prediction_nll,
     run_twice,
 )
@@ -99,14 +99,13 @@ class WeightedLoss(NamedTuple):
         return loss(info, episode)
 
 
-BY_NAME: Mapping[str, Loss] = MappingProxyType(
+BY_NAME: Mapping[str, Any] = MappingProxyType(  # of Loss, which mypy does not see in NamedTuples
     {
         "pose_nll": pose_nll,
         "pose_mse": pose_mse,
         "innovation_nll": innovation_nll,
         "prediction_nll": prediction_nll,
         "closure_nll": closure_nll,
-        "nis_consistency": nis_consistency,
     }
 )
 """The losses by name, as `jaxslam tune --loss` takes them."""
@@ -158,16 +157,13 @@ def needs_truth(loss: Loss) -> bool:
     return loss in (pose_mse, pose_nll)
 
 
-def check_loss(
-    loss: Loss, data: Any, *, name: str = "episodes", model: Model | None = None
-) -> None:
+def check_loss(loss: Loss, data: Any, *, name: str = "episodes") -> None:
     """Check, before any work starts, that a loss can be evaluated on data [B].
 
     Args:
         loss: The loss.
         data: [B] sequences; episodes as `inputs.as_episodes` returns them.
         name: What they are called in the error message.
-        model: The model that is tuned, if it is known.
 
     Raises:
         ValueError: The loss is no function, or a sum without terms; there are no episodes, or
@@ -188,7 +184,7 @@ def check_loss(
     else:
         _check_episodes(loss, data, name)
     for term in compared:
-        term.check(model, data, name)
+        term.check(data, name)
 
 
 def _check_episodes(loss: Loss, data: Episode, name: str) -> None:

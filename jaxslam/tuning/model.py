@@ -67,12 +67,14 @@ class Model(NamedTuple):
             number of steps T.
         check: Parameters, data [B] and their name for messages, to both in arrays; raises
             ValueError where they do not fit the model. Nothing is compiled yet.
+        batch_size: Number of sequences that a device runs together; bounds memory.
     """
 
     init: Callable[..., Any]
     step: Callable[..., tuple[Any, Any]]
     inputs: Callable[..., Any] = whole_sequence
     check: Callable[..., tuple[Any, Any]] = as_arrays
+    batch_size: int = 512
 
 
 def run_model(model: Model, params: Any, sequence: Any) -> tuple[Any, Any]:

@@ -24,8 +24,9 @@ not seen for so many steps: two visits must meet.
 Where the filter fails, as where one landmark is taken for another, must not decide alone. With NIS
 and log-determinants S summed over windows of steps, each less that of p', a window counts
 
-    (rho(NIS) + log det S + n log 2 pi) / 2,    rho(x) = x              up to c, the quantile of 99.9 %
-                                                         c + c log(x/c) of chi-square, n dof; beyond
+    (rho(NIS) + log det S + n log 2 pi) / 2,      rho(x) = x up to c,  c + c log(x / c) beyond,
+
+c being the quantile of 99.9 % of chi-square with the n degrees of freedom of the window.
 
 References:
     Barratt, Boyd (2020), Fitting a Kalman smoother to data: prediction of what is held out. Cox
@@ -46,7 +47,6 @@ from jaxslam.core.episode import Episode
 from jaxslam.core.types import Array
 from jaxslam.filtering.belief import Belief, prune
 from jaxslam.tuning.model import Model
-from jaxslam.tuning.slam_model import SlamStep
 
 NORMAL_QUANTILE = 3.0902  # 99.9 %
 
@@ -87,9 +87,8 @@ class PredictionNll(NamedTuple):
         del sequence
         return _difference_nll(info, self.steps)
 
-    def check(self, model: Model, data: Any, name: str) -> None:
+    def check(self, data: Any, name: str) -> None:
         """Raise ValueError where there is nothing to predict."""
-        del model
         _check_steps(self, data, name)
         if isinstance(data, Episode) and data.landmark_ids is not None:
             for number, ids in enumerate(np.asarray(data.landmark_ids)):
@@ -126,10 +125,9 @@ class ClosureNll(NamedTuple):
         del sequence
         return _difference_nll(info, self.steps)
 
-    def check(self, model: Model, data: Any, name: str) -> None:
+    def check(self, data: Any, name: str) -> None:
         """Raise ValueError where no landmark is seen again, or there are no landmarks."""
-        step = model.step.step if isinstance(model.step, _Step) else model.step
-        if not isinstance(step, SlamStep):
+        if not isinstance(data, Episode):
             raise ValueError(
                 "closures are of the SLAM filter: for a model of your own use PredictionNll, or "
                 "losses.innovation_nll"
@@ -223,8 +221,9 @@ def run_twice(model: Model, loss: Comparison) -> Model:
     """The model run beside itself with less memory, as the loss needs it; infos are `Memories`."""
     if isinstance(model.step, _Step):
         return model
+    # mypy does not see that a NamedTuple can be called.
     init, step = cast(Any, (_Init(model.init), _Step(model.step, loss)))
-    return Model(init, step, model.inputs, model.check)
+    return model._replace(init=init, step=step)
 
 
 def _difference_nll(info: Memories, steps: int) -> Array:

@@ -14,6 +14,7 @@ from jaxslam.filtering.config import init as initial_belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.episodes import EPISODE_BATCH
 from jaxslam.tuning.inputs import as_episodes, as_params, check_scan_matching
 from jaxslam.tuning.model import Model
 
@@ -100,7 +101,7 @@ def slam_model(config: Config) -> Model:
     own = config.filter
     # mypy does not see that a NamedTuple can be called.
     init, step, check = cast(Any, (SlamInit(own), SlamStep(own), SlamCheck(own)))
-    return Model(init, step, measurements, check)
+    return Model(init, step, measurements, check, batch_size=EPISODE_BATCH)
 
 
 def as_model(model: Model | Config) -> Model:
@@ -115,6 +116,6 @@ def as_model(model: Model | Config) -> Model:
         order = "the order is config, params, episodes"  # two that were swapped are the usual cause
         raise ValueError(f"config is {type(model).__name__}, not Config or a tuning.Model; {order}")
     for name, function in model._asdict().items():
-        if not callable(function):
+        if name != "batch_size" and not callable(function):
             raise ValueError(f"model.{name} is {function!r}, not a function")
     return model

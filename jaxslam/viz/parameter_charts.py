@@ -130,6 +130,7 @@ def draw_correlations(axis: Axes, names: Sequence[str], correlation: AnyArray) -
     """
     count = len(names)
     correlation = as_float64("correlation", correlation, (count, count))
+    axis.set_facecolor("#EEEEEE")  # where it is not known
     axis.imshow(correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     axis.set_xticks(range(count), names, rotation=90)
     axis.set_yticks(range(count), names)

@@ -37,6 +37,7 @@ class TuningPage(NamedTuple):
         best: The best evaluation.
         errors: Rows of a table: name, before, after.
         notes: Warnings, one each.
+        series: What the series are whose whiteness is drawn.
     """
 
     title: str
@@ -50,6 +51,7 @@ class TuningPage(NamedTuple):
     best: int
     errors: Sequence[tuple[str, float | None, float | None]]
     notes: Sequence[str] = ()
+    series: str = "innovations"
 
 
 def tuning_page(page: TuningPage) -> Figure:
@@ -70,10 +72,10 @@ def tuning_page(page: TuningPage) -> Figure:
         rows = 1.5, 1.9, 1.7, 0.9 + 0.19 * max(len(page.estimates), 6), 0.25 + 0.15 * len(text)
         grid = GridSpec(
             5, 2, figure=figure, height_ratios=rows, hspace=0.42, wspace=0.24,
-            left=0.085, right=0.975, top=0.945, bottom=0.015,
+            left=0.085, right=0.975, top=0.93, bottom=0.015,
         )  # fmt: skip
-        figure.text(0.085, 0.987, page.title, va="top", fontsize=11, fontweight="bold")
-        figure.text(0.085, 0.968, page.subtitle, va="top", color=GREY)
+        figure.text(0.085, 0.985, page.title, va="top", fontsize=11, fontweight="bold")
+        figure.text(0.085, 0.967, page.subtitle, va="top", color=GREY)
         _draw_errors(figure.add_subplot(grid[0, 0]), page.errors)
         losses = figure.add_subplot(grid[0, 1])
         draw_losses(losses, page.training, page.heldout, page.best)
@@ -132,7 +134,8 @@ def _draw_consistency(figure: Figure, grid: GridSpec, page: TuningPage) -> None:
             axis.tick_params(labelleft=False)
         first = first or axis
     axis = figure.add_subplot(grid[2, 1])
-    axis.set_title("Whiteness of the innovations", loc="left", fontweight="bold")
+    series = "NIS" if after is not None and after.whiteness is None else page.series
+    axis.set_title(f"Whiteness: {series}", loc="left", fontweight="bold")
     if after is None:
         _say(axis, "no measurement was used")
     elif after.whiteness is None:

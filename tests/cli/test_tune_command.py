@@ -119,7 +119,7 @@ def test_noise_json_agrees_with_metrics_json_and_can_be_read_back(done):
     numbers = done.numbers["noise"]
     assert list(numbers) == FILE_KEYS
     assert list(done.numbers["before"]["noise"]) == list(numbers)
-    for name, value in zip(numbers, found, strict=True):
+    for name, value in noise_file.to_keys(found).items():
         assert (value is None) == (numbers[name] is None)
         if value is not None:
             np.testing.assert_allclose(value, numbers[name], rtol=1e-6)
@@ -152,7 +152,7 @@ def test_consistency_parameters_and_correlations_are_written(done):
     numbers = done.numbers
     before, after = (numbers["consistency"][when] for when in ("before", "after"))
     assert abs(np.log(after["nis_per_dof"])) < abs(np.log(before["nis_per_dof"]))
-    assert before["nis_count"] == after["nis_count"] == 19, "every second of 39 steps has features"
+    assert before["nis_count"] == after["nis_count"] > 30
     assert after["nees_per_dof"] == pytest.approx(numbers["nees"], rel=1e-4)
     assert list(after["autocorrelation"]) == ["heading", "to the left", "ahead"]
     for series in after["autocorrelation"].values():

@@ -1,44 +1,65 @@
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxslam.cli import tune_report
 from jaxslam.evaluation import consistency_of_nis
+from jaxslam.filtering.heteroscedastic import MeasurementWeights
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.io import noise_file
+from jaxslam.tuning import parameters
 from jaxslam.tuning.standard_errors import StandardErrors
 
+START = NoiseParams.for_landmark_sensor()
+NAMES = parameters.param_names(START)
 
-def report(errors=None, consistency=None):
-    names, start = tune_report.numbers_of(NoiseParams.for_landmark_sensor())
+
+def report(errors=None, consistency=None, start=START):
     return tune_report.TuneReport(
         before=consistency,
         after=consistency,
-        names=names,
         start=start,
-        found=0.5 * start,
-        frozen=np.array([name == "wall" for name in names]),
+        found=jax.tree.map(lambda x: x / 2, start),
+        frozen=np.array([name.startswith("wall") for name in parameters.param_names(start)]),
         errors=errors,
     )
 
 
 @pytest.fixture
 def errors():
-    names, values = tune_report.numbers_of(NoiseParams.for_landmark_sensor())
-    relative = np.full(len(names), 0.1)
+    relative = np.full(len(NAMES), 0.1)
     covariance = np.diag(relative**2)
     covariance[0, 1] = covariance[1, 0] = -0.004
     relative[4], covariance[4] = np.inf, 0.0  # the data do not determine the range
     covariance[:, 4] = 0.0
     relative[7], covariance[7, 7] = np.nan, 0.0
     sure = np.isfinite(relative)
-    return StandardErrors(names, relative, covariance, sure, ("not identifiable: range",))
+    return StandardErrors(NAMES, relative, covariance, sure, ("not identifiable: range",))
 
 
-def test_numbers_of_noise_are_named_by_their_keys():
-    names, values = tune_report.numbers_of(NoiseParams.for_landmark_sensor())
-    assert names == (*(f"odometry[{i}]" for i in range(4)), "range", "bearing", "scale", "wall")
-    np.testing.assert_allclose(values, [0.1] * 4 + [0.15, 0.03, 1.0, 0.03])
-    laser = tune_report.numbers_of(NoiseParams.for_laser_log(match_scans=True))
-    assert laser[0][-1] == "alignment" and laser[1].shape == (9,)
+def test_numbers_of_all_kinds_are_estimates_by_their_keys():
+    start = START._replace(
+        odometry_cov_rate=jnp.diag(jnp.array([0.01, 0.04, 0.01])),
+        measurement_weights=MeasurementWeights(range=jnp.array([0.0, -0.2, 0.1])),
+    )
+    names = parameters.param_names(start)
+    theta_error = np.full(len(names), 0.1)
+    of_params = jax.tree.map(lambda x: jnp.full_like(x, 0.3), start)
+    whole = StandardErrors(
+        names, theta_error, np.eye(len(names)), np.ones(len(names), bool), (), of_params
+    )
+    found = {each.name: each for each in tune_report.estimates_of(report(whole, start=start))}
+    assert list(found)[:5] == ["odometry[0]", "odometry[1]", "odometry[2]", "odometry[3]", "range"]
+    assert found["bearing"].positive and found["bearing"].std_error == 0.1
+    assert found["bearing"].before == pytest.approx(0.03) and found["bearing"].unit == "rad"
+    weight = found["measurement_weights.range[1]"]
+    assert (weight.before, weight.after, weight.positive) == pytest.approx((-0.2, -0.1, False))
+    assert weight.std_error == pytest.approx(0.3), "its own, not that of its logarithm"
+    factor = [each for name, each in found.items() if name.startswith("odometry_cov_rate[")]
+    assert len(factor) == 6 and not factor[0].positive
+    change = [each.after - each.before for each in factor]
+    assert sorted(change) == pytest.approx([-np.log(2) / 2] * 3 + [0.0] * 3), "half the covariance"
 
 
 def test_parameters_that_are_not_identifiable_or_frozen_are_marked(errors):
@@ -57,7 +78,8 @@ def test_parameters_that_are_not_identifiable_or_frozen_are_marked(errors):
 
 def test_correlations_are_those_of_the_parameters_that_were_tuned(errors):
     correlations = tune_report.report_blocks(report(errors))["correlations"]
-    assert correlations["names"] == [name for name in report().names if name != "wall"]
+    keys = map(noise_file.key_of, NAMES)
+    assert correlations["names"] == [key for key in keys if key != "wall"]
     matrix = np.array(correlations["matrix"])
     assert matrix[0, 1] == pytest.approx(-0.4) and matrix[0, 2] == 0.0
     assert np.isnan(matrix[4]).all() and np.isnan(matrix[:, 4]).all()

@@ -71,10 +71,10 @@ def test_a_correct_filter_is_consistent_in_standard_errors():
 @pytest.mark.parametrize(
     "wrong, cause, sign",
     [
-        ({"q": 0.02}, "Q too small, or noise that is itself correlated: innovations are too", 1),
-        ({"q": 50.0}, "Q too large: innovations are too small", -1),
-        ({"r": 0.2}, "R too small: innovations are too large", -1),
-        ({"r": 5.0}, "R too large, or noise that is itself correlated: innovations are too", 1),
+        ({"q": 0.02}, "Q too small, or noise that is itself correlated", 1),
+        ({"q": 50.0}, "Q too large", -1),
+        ({"r": 0.2}, "R too small", -1),
+        ({"r": 5.0}, "R too large, or noise that is itself correlated", 1),
         ({"q": 0.5, "r": 0.5}, "Q and R too small, by a common factor of 2", 0),
         ({"q": 3.0, "r": 3.0}, "Q and R too large, by a common factor of 2.", 0),
         ({"q": 1.0, "neighbours": 0.7}, "R too large, or noise that is itself correlated", 1),
@@ -102,6 +102,13 @@ def test_a_bias_is_named_and_explains_the_size_of_the_innovations(seed):
     assert all(text.startswith("innovations are") and "the bias, or" in text for text in others)
 
 
+def test_a_bias_does_not_explain_innovations_that_are_too_small():
+    v = 0.5 * np.random.default_rng(0).normal(size=(2000, 1)) + 0.1
+    first, second = consistency_report(v, np.eye(1)).verdicts
+    assert first.startswith("Q and R too large, by a common factor of 4: innovations are too small")
+    assert second.startswith("a bias: innovations have the mean component 0 +0.")
+
+
 def test_a_bias_that_the_state_absorbs_shows_in_nees_alone():
     report = report_of(0, bias=0.2, size=1, trials=40, steps=200)
     assert len(report.verdicts) == 1 and report.verdicts[0].startswith("over-confident: ")
@@ -119,6 +126,15 @@ def test_outliers_and_noise_that_varies_are_named():
         line.startswith("NIS is ") and "noise that varies in time" in line
         for line in consistency_report(v, np.eye(1)).verdicts
     )
+    x = rng.normal(size=4000)
+    for t in range(1, 4000):
+        x[t] += 0.5 * x[t - 1]  # correlated, but of constant size
+    x = x[:, None] * np.sqrt(0.75)
+    scale = np.repeat(np.exp(rng.normal(size=100)), 40)[:, None]
+    for v, varies in ((x, False), (x * scale / np.sqrt(np.mean(scale**2)), True)):
+        lines = consistency_report(v, np.eye(1)).verdicts
+        assert any(line.startswith("innovations are correlated at") for line in lines)
+        assert any(line.startswith("NIS is correlated at") for line in lines) == varies
 
 
 def test_masked_steps_equal_deleted_ones():
@@ -249,6 +265,8 @@ def test_one_trial_needs_no_axis_and_lists_will_do():
     assert one == report_metrics(consistency_report(v, S))
     few = consistency_report([[0.3], [-0.1]], [[1.0]])
     assert few.consistent and few.nis.num_values == 2
+    single = consistency_of_nis([1.0], 1)
+    assert single.verdicts == ("consistent: NIS per dof 1.00 (1 expected, of a single step)",)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def saved_map():
         student_dof=4.0,
         odometry_bias_walk=np.array([0.0, 0.1, 0.2]),
     )
-    params = jax.tree.map(lambda x: np.asarray(x, np.float32), params)
+    params = jax.tree.map(lambda x: np.asarray(x, float), params)
     poses, cov = rng.normal(size=(K, 3)), covariances(K, 3, rng)
     scans = Scan._make((ranges, hit))
     return SavedMap(LIDAR, params, TIMES, poses, cov, scans, belief(rng), arcs, graph(rng))

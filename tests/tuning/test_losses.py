@@ -93,6 +93,8 @@ def test_losses_have_the_names_that_tune_takes():
         "pose_nll": losses.pose_nll,
         "pose_mse": losses.pose_mse,
         "innovation_nll": losses.innovation_nll,
+        "prediction_nll": losses.prediction_nll,
+        "closure_nll": losses.closure_nll,
     }
     assert dict(losses.BY_NAME) == named
     assert [losses.name_of(loss) for loss in named.values()] == list(named)

@@ -57,6 +57,8 @@ class Task(NamedTuple):
         train: [B] episodes.
         test: [H] episodes.
         frozen: Names of parameters that are not tuned.
+        batch_size: Episodes of an update. Where data association changes with the noise, the loss
+            jumps, which stops a line search on all episodes; minibatches go on.
     """
 
     config: Config
@@ -65,6 +67,7 @@ class Task(NamedTuple):
     train: Episode
     test: Episode
     frozen: tuple[str, ...]
+    batch_size: int | None = None
 
 
 def true_params() -> NoiseParams:
@@ -116,6 +119,7 @@ def scans(seed: int, num_trials: int, num_heldout: int, num_scans: int | None) -
         common.take(drives, slice(num_trials)),
         common.take(drives, slice(num_trials, None)),
         ("measurement_weights.range[2]", "measurement_weights.clearance[2]"),  # not of walls
+        batch_size=max(1, num_trials // 2),
     )
 
 
@@ -148,6 +152,7 @@ def _tune(task: Task, start: NoiseParams, num_updates: int) -> common.Numbers:
         task.train,
         loss=innovation_nll,
         num_updates=num_updates,
+        batch_size=task.batch_size,
         frozen=frozen,
     )
     return {"params": ravel_pytree(result.params)[0], "loss": result.loss}

@@ -45,6 +45,7 @@ STRAIGHT = [(1.0, 1.0), (4.5, 1.0)]
 NUM_STRAIGHT, STRAIGHT_NOISE = 8, 0.001  # drives, [m / sqrt(m)] of the encoders
 UNCALIBRATED_UPDATES, KNOWN_UPDATES = 30, 30
 NOISE_NUMBERS = 8  # of the parameters, before those of the calibration
+MAX_CHANGE = 0.4  # of a number in one step of Newton's method
 LEAST_CURVATURE = 1e-4  # of a direction that Newton's method takes, per the largest one
 
 
@@ -85,7 +86,8 @@ def newton(hessian: np.ndarray) -> optax.GradientTransformation:
 
     def update(gradient: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
         del params
-        return -(inverse @ gradient), state
+        change = -(inverse @ gradient)
+        return change * jnp.minimum(1.0, MAX_CHANGE / jnp.max(jnp.abs(change))), state
 
     return optax.GradientTransformation(lambda _: optax.EmptyState(), update)
 
@@ -283,9 +285,8 @@ def draw(numbers: common.Numbers, path: Any) -> None:
     """Results of all starts in standard errors, and held-out errors."""
     figure, axes = common.canvas(13, 4.6, 1, 2, [3, 2])
     left, right = axes[0]
-    for row, colour, side in zip(
-        numbers["rows"], (common.GREEN, common.PINK), (-0.15, 0.15), strict=True
-    ):
+    styles = ((common.GREEN, -0.15), (common.PINK, 0.15))
+    for row, (colour, side) in zip(numbers["rows"], styles, strict=False):
         z = np.array([one["theta"] for one in row["rows"]]) - np.array(row["truth"])
         z = z / np.array([np.nan if x is None else x for x in row["standard_errors"]])
         for i in range(NOISE_NUMBERS, z.shape[1]):

@@ -69,9 +69,9 @@ def _drives(
     def one(key: Key) -> Episode:
         keys = jax.random.split(key)
         truth, odometry = drive(keys[0], robot, path, num_scans=num_scans)
-        measured = jax.vmap(exact_model.measure, in_axes=(0, None, None, 0))(
-            jax.random.split(keys[1], num_scans), params, positions, truth
-        )
+        measure = jax.vmap(exact_model.measure, in_axes=(0, None, None, None, 0, 0))
+        own = jax.random.split(keys[1], num_scans)
+        measured = measure(own, params, positions, None, truth, odometry)
         return Episode(truth, odometry, *measured)
 
     return jax.lax.map(one, trials.trial_keys(key, jnp.arange(num_trials)))

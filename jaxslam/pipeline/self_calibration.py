@@ -46,6 +46,9 @@ MATCH_STD_SCALE = 0.3
 MAX_TIMES_BACK = 0.01
 """Fraction of the time stamps that may run backwards, for the others to be trusted."""
 
+LEAST_INTERVAL = 1e-6
+"""[s] between two scans."""
+
 MIN_INTERVAL = 0.1
 """Interval between two scans, of the median one, below which their stamps are those of a queue."""
 
@@ -155,12 +158,15 @@ def require_wheels(log: LaserLog, source: OdometrySource = "scan") -> None:
         raise ValueError("there is no odometry to calibrate where scans alone are matched")
 
 
-def usable_times(times: np.ndarray) -> np.ndarray:
-    """Time stamps (T,) [s] that do not decrease; all 0 where they cannot be trusted."""
-    back = np.diff(times) < 0.0
-    if len(times) < 2 or np.mean(back) > MAX_TIMES_BACK:
-        return np.zeros(len(times))
-    return np.maximum.accumulate(times)
+def usable_times(times: np.ndarray) -> np.ndarray | None:
+    """Time stamps (T,) [s] since the first one, increasing; None where they cannot be trusted.
+
+    A stamp that runs backwards, or is as the one before, becomes one just after it.
+    """
+    times = np.asarray(times, np.float64)
+    if len(times) < 2 or np.mean(np.diff(times) < 0.0) > MAX_TIMES_BACK or not np.ptp(times):
+        return None
+    return np.maximum.accumulate(times - times[0]) + LEAST_INTERVAL * np.arange(len(times))
 
 
 def wheel_frame(odometry: np.ndarray, mount: np.ndarray, usable: np.ndarray) -> np.ndarray:
@@ -203,7 +209,7 @@ def motion_spans(
     odometry: np.ndarray,
     matches: ScanMatch,
     guessed: np.ndarray,
-    times: np.ndarray,
+    times: np.ndarray | None,
     mount: np.ndarray,
 ) -> MotionSpans:
     """The spans of a drive between keyframes.
@@ -224,7 +230,7 @@ def motion_spans(
     motion = keyframes.compose_matches(matches, is_keyframe)
     inliers = np.asarray(matches.inlier_fraction)
     bad = guessed | given.after_pause | given.new_drive | (inliers < breaks.PAUSE_INLIERS)
-    bad |= ~np.asarray(matches.information).any(axis=(1, 2)) | _in_queue(times)
+    bad |= ~np.asarray(matches.information).any(axis=(1, 2)) | _in_queue(times, len(found))
     num_bad = np.cumsum(bad)
     reported = dead_reckoning(np.zeros(3), odometry)
     first, last = ends[:-1], ends[1:]
@@ -243,18 +249,18 @@ def motion_spans(
     )
 
 
-def _in_queue(times: np.ndarray) -> np.ndarray:
-    """Whether each of the scans (T,) was stamped at once with another, and not when it was taken.
+def _in_queue(times: np.ndarray | None, count: int) -> np.ndarray:
+    """Whether each of `count` scans was stamped at once with another, and not when it was taken.
 
     By such a stamp, the robot would have driven a whole increment in no time.
     """
+    queued = np.zeros(count, bool)
+    if times is None:
+        return queued
     interval = np.diff(times)
-    if not interval.any():
-        return np.zeros(len(times), bool)
     short = np.flatnonzero(interval < MIN_INTERVAL * np.median(interval))
-    queued = np.zeros(len(times), bool)
-    for k in (0, 1, 2):  # the increments between both, before, and after
-        queued[np.minimum(short + k, len(times) - 1)] = True
+    for k in (0, 1, 2):  # the increments before, between both, and after
+        queued[np.minimum(short + k, count - 1)] = True
     return queued
 
 

@@ -71,7 +71,7 @@ class MotionSpans(NamedTuple):
     """T scans of a drive, and the N spans that they are cut into.
 
     Attributes:
-        times: (T,) [s] of the scans, not decreasing; all equal where none are to be trusted.
+        times: (T,) [s] of the scans, increasing; None where they are not to be trusted.
         odometry: (T, 3) [m, m, rad] increments since the scan before, zero at the first, of the
             scanner at `mount` by uncalibrated wheels.
         mount: (3,) [m, m, rad] where the scanner was taken to be, in the frame between the wheels.
@@ -231,11 +231,11 @@ def estimate_calibration(
         spans: Of one drive, NumPy; none usable: the result is the prior.
         mean: Of the prior; no systematic errors by default.
         prior_std: Its standard deviations, 0 for a number that is held fixed; by default
-            `default_prior_std`. The time offset is held fixed where all times are equal.
+            `default_prior_std`. The time offset is held fixed without times.
     """
     mean = Calibration.identity() if mean is None else mean
     prior_std = default_prior_std() if prior_std is None else prior_std
-    if np.ptp(spans.times) == 0.0:
+    if spans.times is None:
         prior_std = prior_std._replace(time_offset=np.zeros(()))
     middle, scale, nu = flat(mean), flat(prior_std), DEGREES_OF_FREEDOM
     own = np.flatnonzero(spans.usable)
@@ -279,13 +279,31 @@ def _noise_of(
     start: CalibrationNoise, error: np.ndarray, driven: np.ndarray, match_cov: np.ndarray
 ) -> CalibrationNoise:
     """The noise of greatest probability, of errors (N, 3)."""
-    typical = np.log(np.concatenate(CalibrationNoise.typical()))
+    typical, nu = np.log(np.concatenate(CalibrationNoise.typical())), DEGREES_OF_FREEDOM
+    table = np.concatenate([error[..., None], np.tile(np.eye(3), (len(error), 1, 1))], axis=-1)
+    ones = np.ones(len(driven))
+    along = np.stack([driven[:, 0], driven[:, 1], 0 * ones, 0 * ones, ones, 0 * ones], axis=1)
+    turn = np.stack([0 * ones, 0 * ones, driven[:, 0], driven[:, 1], 0 * ones, ones], axis=1)
 
     def noise(logs: np.ndarray) -> CalibrationNoise:
         return CalibrationNoise(np.exp(logs[:4]), np.exp(logs[4:]))
 
-    def cost(logs: np.ndarray) -> float:
-        prior = np.sum(((logs - typical) / NOISE_LOG_STD) ** 2) / 2
-        return float(prior - np.sum(log_density(noise(logs), error, driven, match_cov)[0]))
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log posterior, and its gradient.
 
-    return noise(minimize(cost, np.log(np.concatenate(start)), method="L-BFGS-B").x)
+        Of log p, by an element q of the diagonal of C: (w (C^-1 e)^2 - C^-1) / 2.
+        """
+        whitened, log_det = whitened_errors(noise(logs), table, driven, match_cov)
+        residual, root = whitened[..., 0], whitened[..., 1:]
+        square = np.sum(residual**2, axis=-1)
+        value = np.sum(log_det + (nu + 3) * np.log1p(square / nu)) / 2
+        pull = np.einsum("nai,na->ni", root, residual)
+        weight = (nu + 3) / (nu + square)
+        slope = (np.sum(root**2, axis=1) - weight[:, None] * pull**2) / 2
+        by_variance = along.T @ (slope[:, 0] + slope[:, 1]) + turn.T @ slope[:, 2]
+        off = (logs - typical) / NOISE_LOG_STD
+        gradient = by_variance * 2 * np.exp(2 * logs) + off / NOISE_LOG_STD
+        return float(value + np.sum(off**2) / 2), gradient
+
+    start_logs = np.log(np.concatenate(start))
+    return noise(minimize(cost, start_logs, jac=True, method="L-BFGS-B").x)

@@ -108,7 +108,7 @@ def cut_into_pieces(drives: Sequence[MotionSpans], num_pieces: int = NUM_PIECES)
     """
     total = sum(len(spans.usable) for spans in drives)
     longest = max(total // num_pieces, 1)
-    pieces = []
+    pieces, timed = [], all(spans.times is not None for spans in drives)
     for spans in drives:
         count = -(-len(spans.usable) // longest)
         for part in np.array_split(np.arange(len(spans.usable)), count):
@@ -121,7 +121,7 @@ def cut_into_pieces(drives: Sequence[MotionSpans], num_pieces: int = NUM_PIECES)
             }
             pieces.append(
                 spans._replace(
-                    times=spans.times[begin:end] - spans.times[begin],
+                    times=spans.times[begin:end] - spans.times[begin] if timed else None,
                     odometry=spans.odometry[begin:end],
                     first=spans.first[some] - begin,
                     last=spans.last[some] - begin,
@@ -142,7 +142,7 @@ def _padded(piece: MotionSpans, scans: int, spans: int) -> MotionSpans:
     usable[: len(piece.usable)] = piece.usable
     names = "first", "last", "increment", "match_cov", "driven"
     by_span = {name: pad_to(getattr(piece, name), to=spans) for name in names}
-    times = pad_to(piece.times, to=scans)
+    times = None if piece.times is None else pad_to(piece.times, to=scans)
     return piece._replace(times=times, odometry=odometry, usable=usable, **by_span)
 
 
@@ -163,7 +163,7 @@ def tune_calibration(
     if len(data.usable) < 2:
         raise ValueError("a calibration with standard errors needs two spans between keyframes")
     frozen: tuple[str, ...] = ()
-    if all(np.ptp(spans.times) == 0.0 for spans in drives):
+    if data.times is None:
         frozen = ("calibration.time_offset",)
     params: Any = CalibrationParams(start.calibration, start.noise)
     typical, std = CalibrationNoise.typical(), default_prior_std()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import reference_filter
 
-from jaxslam.core.features import Features
 from jaxslam.core.types import JUNCTION, WALL
 from jaxslam.frontend.features import features_from_range_bearing
 from jaxslam.smoothing.numbering import number_landmarks
@@ -72,7 +71,7 @@ def test_landmarks_that_do_not_fit_are_refused_by_name():
 def test_lists_numpy_and_jax_of_either_precision_give_the_same():
     features = features_of_landmarks()
     expected = number_landmarks(jnp.array(ID), jnp.array(POSES), features)
-    lists = Features(*(np.asarray(x).tolist() for x in features))
+    lists = jax.tree.map(lambda x: np.asarray(x).tolist(), features)
     jax.tree.map(
         np.testing.assert_array_equal,
         number_landmarks(ID.tolist(), POSES.tolist(), lists),

@@ -44,7 +44,7 @@ def test_lists_numpy_and_jax_of_either_precision_give_the_same():
     numpy = jax.tree.map(np.asarray, measurements)
     lists = Measurement(
         measurements.odometry.tolist(),
-        type(numpy.features)(*(x.tolist() for x in numpy.features)),
+        jax.tree.map(lambda x: x.tolist(), numpy.features),
     )
     single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == float else x, numpy)
     params = NoiseParams(*(None if x is None else np.asarray(x).tolist() for x in NOISE))

@@ -1,10 +1,13 @@
 """The EKF of a user's functions against a textbook filter, finite differences and dynamax."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import any_model
 from jaxslam.tuning import batch_last, fitting
 from jaxslam.tuning.ekf_model import EkfSequence, ekf_model
 from jaxslam.tuning.model import Model, run_model
@@ -224,12 +227,18 @@ def test_a_model_whose_state_changes_is_refused():
         assert message in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_likelihood_is_that_of_dynamax_of_a_pendulum_and_of_beacons():
-    models = pytest.importorskip("experiments.any_model")
-    pytest.importorskip("dynamax", exc_type=ImportError)
-    for name in models.MODELS:
-        task = models.task(name, seed=1, num_trials=2, num_steps=12)
-        own, peer = (jax.vmap(jax.value_and_grad(f), in_axes=(None, 0)) for f in task.likelihoods())
-        (a, da), (b, db) = own(task.params, task.data), peer(task.params, task.data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pytest.importorskip("dynamax.nonlinear_gaussian_ssm", exc_type=ImportError)
+    for name in any_model.MODELS:
+        task = any_model.task(name, seed=1, num_trials=2, num_steps=12)
+        own, peer = (
+            jax.jit(jax.vmap(jax.value_and_grad(f), in_axes=(None, 0))) for f in task.likelihoods()
+        )
+        (a, da) = own(task.params, task.data)
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+            (b, db) = peer(task.params, task.data)
         np.testing.assert_allclose(a, b, rtol=1e-6)
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4), da, db)

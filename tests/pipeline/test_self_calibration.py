@@ -1,0 +1,100 @@
+"""Calibration of a log by its own scans, from wheels and mounts that are off by known amounts."""
+
+import numpy as np
+import pytest
+from office_drive import LIDAR, office_drive, take
+
+from jaxslam.core.calibration import Calibration, calibrate_odometry
+from jaxslam.core.logs import LaserLog
+from jaxslam.core.se2_np import compose, dead_reckoning, increments, relative
+from jaxslam.pipeline import log_input, self_calibration
+from jaxslam.smoothing.odometry_calibration import flat, unflat
+
+TRUE = unflat(np.array([1.05, 0.95, 0.02, 0.2, 0.05, 0.05, 0.0]))
+NO_TIME = np.zeros(3)
+
+
+def reported_by(calibration, poses):
+    """Increments that uncalibrated wheels report of a scanner at poses (T, 3), by Newton steps."""
+    moved = increments(poses)
+    guess = moved.copy()
+    for _ in range(30):
+        guess = guess + (moved - calibrate_odometry(calibration, guess))
+    np.testing.assert_allclose(calibrate_odometry(calibration, guess), moved, atol=1e-6)
+    return guess
+
+
+def test_times_that_cannot_be_trusted():
+    back = np.arange(10.0)
+    back[4] = 1.0
+    assert self_calibration.usable_times(back) is None
+    assert self_calibration.usable_times(np.full(10, 7.0)) is None
+    some = np.repeat(np.arange(200.0), 2)
+    some[7] = 0.0
+    found = self_calibration.usable_times(some)
+    assert np.all(np.diff(found) > 0) and np.abs(found - np.maximum.accumulate(some)).max() < 1e-3
+
+
+@pytest.mark.parametrize("place", [[0.0, 0.0, 0.0], [-0.25, 0.0, -0.05]])
+def test_the_frame_between_the_wheels_is_found(place):
+    """From how the poses of a scanner move sideways, a tenth of them by anything."""
+    rng = np.random.default_rng(0)
+    turn = 0.3 * rng.normal(size=300)
+    chord = rng.uniform(0.1, 0.4, 300) * np.sinc(turn / (2 * np.pi))
+    wheels = np.stack([chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn], axis=1)
+    wheels[:, 1] += 0.002 * rng.normal(size=300)
+    wheels[::10, 1] += 0.2 * rng.normal(size=30)
+    moved = compose(compose(relative(np.array(place), NO_TIME), wheels), np.array(place))
+    found = self_calibration.wheel_frame(moved, np.zeros(3), np.ones(300, bool))
+    np.testing.assert_allclose(found, place, atol=2e-3)
+    # The same robot, whose log says where its scanner is.
+    mount = np.array([0.1, 0.3, 1.0])
+    on_robot = self_calibration.wheel_frame(
+        compose(compose(relative(mount, NO_TIME), moved), mount), mount, np.ones(300, bool)
+    )
+    np.testing.assert_allclose(on_robot, compose(np.array(place), mount), atol=2e-3)
+
+
+def test_a_robot_that_drives_to_all_sides_keeps_its_frame():
+    moved = np.random.default_rng(1).normal(size=(300, 3)) * [0.3, 0.3, 0.2]
+    mount = np.array([0.3, 0.1, 0.2])
+    found = self_calibration.wheel_frame(moved, mount, np.ones(300, bool))
+    np.testing.assert_array_equal(found, mount)
+
+
+def test_scans_without_wheels_are_refused():
+    log = LaserLog.from_arrays([0.0], [[0.0, 0.0, 0.0]], np.ones((1, LIDAR.num_beams)), LIDAR)
+    with pytest.raises(ValueError, match="no odometry to calibrate: the log"):
+        self_calibration.require_wheels(log._replace(has_odometry=False))
+    with pytest.raises(ValueError, match="where scans alone are matched"):
+        self_calibration.require_wheels(log, "scans-only")
+
+
+@pytest.fixture(scope="module")
+def office_log():
+    """A drive through the office by wheels that are off; and the true poses of its scanner."""
+    poses, scans = office_drive()
+    poses, scans = poses[:160], take(scans, slice(160))
+    wheels = dead_reckoning(np.zeros(3), reported_by(TRUE, poses))
+    ranges = np.where(scans.hit, scans.ranges, np.inf)
+    log = LaserLog.from_arrays(np.zeros(len(poses)), wheels, ranges, LIDAR)
+    return log, poses
+
+
+@pytest.mark.slow
+def test_a_drive_through_the_office_calibrates_itself(office_log):
+    log, poses = office_log
+    given = log_input.from_laser_log(log)
+    found = self_calibration.calibrate_log(log, given, mount=np.zeros(3))
+    one = found.estimate
+    assert one.not_determined == ("time_offset",) and found.num_rounds >= 2
+    off = (flat(one.calibration) - flat(TRUE))[:6]
+    assert np.all(
+        np.abs(off) < 4 * flat(one.standard_errors)[:6] + [0.01, 0.01, 2e-3, 0.01, 0.01, 5e-3]
+    )
+    moved = self_calibration.calibrated(log, given, one.calibration, found.mount)
+    path = relative(poses[0], poses)[:, :2]
+    errors = [np.hypot(*(x[:, :2] - path).T).max() for x in (given.odom_poses, moved.odom_poses)]
+    assert errors[1] < 0.15 * errors[0]
+    identity = self_calibration.calibrated(log, given, Calibration.identity(), found.mount)
+    np.testing.assert_allclose(identity.increments, given.increments, atol=1e-9)

@@ -168,7 +168,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
         axis.axhline(1.0, color=common.BLACK, linewidth=0.8)
         axis.set(ylim=(0.05, 20.0), ylabel="noise / true noise", title=kind)
         common.log_scale(axis)
-        axis.set_xticks(range(len(numbers["names"])), numbers["names"])
+        short = [name.replace("_coefficients", " ") for name in numbers["names"]]
+        axis.set_xticks(range(len(short)), short)
     axes[0, 0].plot([], [], "x", color=common.BLACK, label="not identifiable")
     axes[0, 0].legend(fontsize="small", ncols=4)
     figure.savefig(path)

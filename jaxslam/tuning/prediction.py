@@ -36,6 +36,7 @@ References:
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -51,6 +52,9 @@ from jaxslam.tuning.model import Model
 NORMAL_QUANTILE = 3.0902  # 99.9 %
 
 
+# Losses are static under jit, and two records of one number would be equal: dataclasses are not.
+
+
 class Memories(NamedTuple):
     """What the steps [T] of a model returned.
 
@@ -63,7 +67,8 @@ class Memories(NamedTuple):
     part: Any
 
 
-class PredictionNll(NamedTuple):
+@dataclass(frozen=True)
+class PredictionNll:
     """Negative log-density [nats], per scalar, of the map of each part of a drive: a loss.
 
     The model starts anew, by `Model.init`, at each part, to be compared with the one that goes on.
@@ -102,7 +107,8 @@ class PredictionNll(NamedTuple):
                     )
 
 
-class ClosureNll(NamedTuple):
+@dataclass(frozen=True)
+class ClosureNll:
     """Negative log-density [nats], per scalar, of landmarks seen again after some time: a loss.
 
     It is of the SLAM filter only. What does not return to a landmark has no part in it.
@@ -149,7 +155,8 @@ Comparison = PredictionNll | ClosureNll
 prediction_nll, closure_nll = PredictionNll(), ClosureNll()
 
 
-class NisConsistency(NamedTuple):
+@dataclass(frozen=True)
+class NisConsistency:
     """Squared z-score of the logarithm of NIS, mean over windows: a loss, or a term of one.
 
         (log(NIS / n) - digamma(n / 2) + log(n / 2))^2 n / 2

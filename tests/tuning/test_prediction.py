@@ -195,7 +195,13 @@ def test_a_forgotten_landmark_is_a_new_one(robot):
         np.testing.assert_array_equal(found.dof, alone.dof)
 
 
-def test_losses_that_predict_check_their_data(robot):
+def test_losses_of_one_number_are_not_taken_for_each_other():
+    """Else a program compiled for one would run for the other."""
+    losses = [kind(8) for kind in (PredictionNll, ClosureNll, NisConsistency)]
+    assert len(set(losses)) == 3 and losses[0] == PredictionNll(8) and losses[0] != PredictionNll(9)
+
+
+def test_losses_that_predict_check_their_data(robot, sequence):
     drive, ids = robot
     drives = stack_episodes([drive(ids), drive(ids)])
     with pytest.raises(ValueError, match="have 16 steps, of which PredictionNll needs more than"):
@@ -208,7 +214,7 @@ def test_losses_that_predict_check_their_data(robot):
     with pytest.raises(ValueError, match="steps is 0, not a whole number"):
         fitting.values(CONFIG, NOISE, drives, ClosureNll(0))
     with pytest.raises(ValueError, match="closures are of the SLAM filter"):
-        fitting.values(LINE, PARAMS, {"moved": np.ones((1, 3))}, "closure_nll")
+        fitting.values(LINE, PARAMS, jax.tree.map(lambda x: x[None], sequence), "closure_nll")
     two = WeightedLoss(((1.0, ClosureNll(2)), (1.0, PredictionNll(2))))
     with pytest.raises(ValueError, match="two losses that run the model twice"):
         fitting.values(CONFIG, NOISE, drives, two)

@@ -130,7 +130,7 @@ def ekf_model(
     Raises:
         ValueError: A function is none, or an index is no whole number of at least 0.
     """
-    given = {"init": init, "motion": motion, "measure": measure}
+    given: dict[str, Any] = {"init": init, "motion": motion, "measure": measure}
     given |= {"motion_cov": motion_cov, "measurement_cov": measurement_cov}
     for name, function in given.items():
         if not callable(function):
@@ -161,8 +161,9 @@ def _build(functions: _Functions) -> Model:
     def step(params: Any, state: EkfState, now: EkfSequence) -> tuple[EkfState, EkfInfo]:
         # Of the smallest matrices XLA's own products are faster than vectors over the batch.
         last = max(state.mean.size, now.measurements.size) > SMALL
-        (mean, cov, *rest), (dof, finite) = compute[last]((params, state, now))
-        info = EkfInfo(mean, cov, *rest[:3], dof, rest[3], finite)
+        floats, (dof, finite) = compute[last]((params, state, now))
+        mean, cov, innovation, innovation_cov, nis, log_likelihood = floats
+        info = EkfInfo(mean, cov, innovation, innovation_cov, nis, dof, log_likelihood, finite)
         return EkfState(mean, cov, jnp.ones_like(state.moves)), info
 
     return Model(partial(_init, functions), step, _inputs, partial(_check, functions))

@@ -161,8 +161,8 @@ def _build(functions: _Functions) -> Model:
     def step(params: Any, state: EkfState, now: EkfSequence) -> tuple[EkfState, EkfInfo]:
         # Of the smallest matrices XLA's own products are faster than vectors over the batch.
         last = max(state.mean.size, now.measurements.size) > SMALL
-        numbers, (dof, finite) = compute[last]((params, state, now))
-        mean, cov, innovation, innovation_cov, nis, log_likelihood = numbers
+        floats, (dof, finite) = compute[last]((params, state, now))
+        mean, cov, innovation, innovation_cov, nis, log_likelihood = floats
         info = EkfInfo(mean, cov, innovation, innovation_cov, nis, dof, log_likelihood, finite)
         return EkfState(mean, cov, jnp.ones_like(state.moves)), info
 

@@ -172,7 +172,7 @@ def matmul(a: Array, b: Array) -> Array:
     product of a batch, and repeats a sum of products inside of every operation that uses it.
     """
     if a.ndim == 2:
-        return a @ b
+        return a * b if a.shape[1] == 1 else a @ b
     if a.shape[1] > UNROLLED:
         return jnp.einsum("ik...,kj...->ij...", a, b)
     return jnp.sum(a[:, :, None] * b[None], axis=1)

@@ -97,9 +97,19 @@ class NoiseParams(NamedTuple):
         return cls(*_arrays([0.05, 0.05, 0.05, 0.05], 0.05, 0.01, 1.5, 0.03))
 
     @classmethod
-    def for_landmark_sensor(cls) -> "NoiseParams":
-        """Hand-set noise for a small robot that measures range and bearing of known landmarks."""
-        return cls(*_arrays([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03))
+    def for_landmark_sensor(cls, *, student_dof: float | None = None) -> "NoiseParams":
+        """Hand-set noise for a small robot that measures range and bearing of known landmarks.
+
+        Args:
+            student_dof: Of innovations with heavy tails, as where the sensor takes one landmark for
+                another now and then: 4, for example. None: they are Gaussian.
+        """
+        params = cls(*_arrays([0.1, 0.1, 0.1, 0.1], 0.15, 0.03, 1.0, 0.03))
+        return (
+            params
+            if student_dof is None
+            else params._replace(student_dof=jnp.asarray(student_dof, float))
+        )
 
 
 def _arrays(*numbers: Any) -> Iterator[Any]:

@@ -118,7 +118,7 @@ def assemble(path: str | PathLike, raw: RawLog, options: LogOptions) -> LaserLog
         has_odometry=track.usable,
         odometry_guessed=track.is_stale,
         mount=mount.pose if raw.mount is None or mount.pose.any() else raw.mount,
-        frames=(raw.base_frame, frame),
+        frames=(raw.base_frame, frame) if raw.names_frames else ("", ""),
     )
 
 

@@ -17,6 +17,7 @@ from jaxslam.core.batching import pad_to
 from jaxslam.core.calibration import Calibration
 from jaxslam.core.types import Array
 from jaxslam.smoothing.odometry_calibration import (
+    DETERMINED,
     NOISE_LOG_STD,
     CalibrationEstimate,
     CalibrationNoise,
@@ -30,7 +31,7 @@ from jaxslam.smoothing.odometry_calibration import (
 from jaxslam.tuning import fitting, standard_errors
 from jaxslam.tuning.model import Model
 from jaxslam.tuning.priors import Prior
-from jaxslam.tuning.transforms import POSITIVE
+from jaxslam.tuning.transforms import POSITIVE, real
 
 NUM_PIECES = 16
 """Of all drives, at least: they are the independent sequences of the standard errors."""
@@ -146,6 +147,17 @@ def _padded(piece: MotionSpans, scans: int, spans: int) -> MotionSpans:
     return piece._replace(times=times, odometry=odometry, usable=usable, **by_span)
 
 
+def _transforms() -> Calibration:
+    """Numbers in units in which a standard error of 1 is that of what is not determined.
+
+    They are small for scales, too, whose logarithms would be changed by more than is known of them.
+    """
+    units = (DETERMINED * np.asarray(x, float) for x in default_prior_std())
+    return Calibration._make(
+        real(float(x)) if np.ndim(x) == 0 else real(tuple(x.tolist())) for x in units
+    )
+
+
 def tune_calibration(
     drives: Sequence[MotionSpans], start: CalibrationEstimate, *, num_updates: int = 20
 ) -> CalibrationEstimate:
@@ -172,7 +184,7 @@ def tune_calibration(
     prior = CalibrationParams(Calibration._make(of_calibration), CalibrationNoise._make(of_noise))
     options: dict[str, Any] = {
         "loss": span_nll,
-        "transforms": CalibrationParams(None, POSITIVE),  # type: ignore[arg-type]
+        "transforms": CalibrationParams(_transforms(), POSITIVE),  # type: ignore[arg-type]
         "prior": prior,
         "frozen": frozen,
     }

@@ -132,7 +132,10 @@ def find_calibration(
     num_spans = found.estimate.num_spans
     counts = f"{num_spans} spans, scans matched {found.num_rounds} times"
     print_calibration(robot, f"calibration of {path}, by {counts}:")
-    return robot, {"spans": num_spans, "rounds": found.num_rounds}
+    if not found.is_settled:
+        print("note: the calibration still changed when the scans were matched last")
+    about = {"spans": num_spans, "rounds": found.num_rounds, "settled": found.is_settled}
+    return robot, about
 
 
 def tune_calibration(

@@ -66,12 +66,14 @@ class LogCalibration(NamedTuple):
         mount: (3,) [m, m, rad] where the scanner was taken to be, in the frame between the wheels.
         num_rounds: How often all scans were matched.
         spans: Of the drive, as they were matched last.
+        is_settled: Whether the calibration has come to rest in these rounds.
     """
 
     estimate: CalibrationEstimate
     mount: np.ndarray
     num_rounds: int
     spans: MotionSpans
+    is_settled: bool
 
 
 def calibrate_log(
@@ -112,7 +114,8 @@ def calibrate_log(
         calibration = estimate.calibration
         change, before = np.abs(flat(calibration) - before), flat(calibration)
         limit = CONVERGED * flat(estimate.standard_errors)
-    return LogCalibration(estimate, taken, num_rounds, spans)
+    is_settled = bool(np.all(change <= limit))
+    return LogCalibration(estimate, taken, num_rounds, spans, is_settled)
 
 
 def calibrated(

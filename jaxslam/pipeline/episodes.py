@@ -115,7 +115,8 @@ def filter_episodes(
             lead with B and T; or they hold scan matches that the parameters have no noise for, or
             landmarks that the map has no slots for.
     """
-    return filter_batch(config.filter, *check_drives(config, params, episodes))
+    params, stacked = check_drives(config, params, episodes)
+    return filter_batch(config.filter, params, stacked)
 
 
 def check_drives(

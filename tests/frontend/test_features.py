@@ -86,7 +86,7 @@ def test_features_turn_with_world_and_robot(seed):
 def test_padding_is_zero():
     found = features(worlds.named("fig07").walls, np.array([2.2, 2.3, 2.0]))[0]
     assert found.kind.size == SPEC.max_features and 0 < found.valid.sum() < SPEC.max_features
-    for field in found._replace(kind=found.degree):
+    for field in jax.tree.leaves(found._replace(kind=found.degree)):
         assert not np.any(np.asarray(field)[~np.asarray(found.valid)])
 
 
@@ -98,7 +98,7 @@ def test_restricted_features_are_wanted_and_finite():
     )
     kept = restrict_features(broken, jnp.arange(found.kind.size) != good[2])
     np.testing.assert_array_equal(np.flatnonzero(kept.valid), good[3:])
-    assert all(np.isfinite(np.asarray(field, float)).all() for field in kept)
+    assert all(np.isfinite(np.asarray(field, float)).all() for field in jax.tree.leaves(kept))
     assert not kept.xy[good[:3]].any() and not kept.cov[good[:3]].any()
     np.testing.assert_array_equal(kept.xy[good[3:]], found.xy[good[3:]])
 

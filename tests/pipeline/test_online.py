@@ -132,7 +132,7 @@ def test_chunks_give_the_result_of_one_filter_with_full_capacity(drive, results,
     assert_close(found.info._replace(slot=slot), info)
     assert_close(found.features, features)
     assert_close(found.scan_matches, matches)
-    for few, many in zip(found.belief, belief, strict=True):
+    for few, many in zip(*map(jax.tree.leaves, (found.belief, belief)), strict=True):
         np.testing.assert_allclose(few, np.asarray(many)[tuple(map(slice, few.shape))], atol=1e-9)
     state = after[-1][0]
     assert_close(state.arcs, jax.tree.map(lambda x: x[: 2 * size], arcs))

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from experiments import calibration_drives, common
 from experiments.calibration_drives import CONFIG, HURT
+from experiments.calibration_picture import NOISE_NUMBERS, draw
 from experiments.closed_form_calibration import closed_form
 from jaxslam.core import se2_np
 from jaxslam.core.caches import enable_caches
@@ -44,7 +45,6 @@ FACTOR = 2.0  # within which each noise of a start is off
 STRAIGHT = [(1.0, 1.0), (4.5, 1.0)]
 NUM_STRAIGHT, STRAIGHT_NOISE = 8, 0.001  # drives, [m / sqrt(m)] of the encoders
 UNCALIBRATED_UPDATES, KNOWN_UPDATES = 30, 30
-NOISE_NUMBERS = 8  # of the parameters, before those of the calibration
 MAX_CHANGE = 0.4  # of a number in one step of Newton's method
 LEAST_CURVATURE = 1e-4  # of a direction that Newton's method takes, per the largest one
 
@@ -279,40 +279,6 @@ def straight(seed: int, num_scans: int) -> common.Numbers:
     own = noise.odometry_coefficients * (STRAIGHT_NOISE / HURT.encoder_noise)
     noise = noise._replace(odometry_coefficients=own)
     return _errors(LOSSES[0], CalibratedParams(noise, robot.calibration()), drives)
-
-
-def draw(numbers: common.Numbers, path: Any) -> None:
-    """Results of all starts in standard errors, and held-out errors."""
-    figure, axes = common.canvas(13, 4.6, 1, 2, [3, 2])
-    left, right = axes[0]
-    styles = ((common.GREEN, -0.15), (common.PINK, 0.15))
-    for row, (colour, side) in zip(numbers["rows"], styles, strict=False):
-        z = np.array([one["theta"] for one in row["rows"]]) - np.array(row["truth"])
-        z = z / np.array([np.nan if x is None else x for x in row["standard_errors"]])
-        for i in range(NOISE_NUMBERS, z.shape[1]):
-            left.plot(np.full(len(z), i + side), z[:, i], "D", color=colour, markersize=4)
-        left.plot([], [], "D", color=colour, label=row["loss"])
-    left.axhspan(-3, 3, color=common.BLACK, alpha=0.1, label="3 standard errors")
-    names = [name.removeprefix("calibration.") for name in numbers["rows"][0]["names"]]
-    ticks = range(NOISE_NUMBERS, len(names))
-    left.set_xticks(ticks, names[NOISE_NUMBERS:], rotation=20, ha="right")
-    left.set(ylabel="error [standard errors]", title="all starts")
-    left.legend(fontsize="small")
-    bars = {
-        "no calibration": numbers["peers"]["uncalibrated_rmse_m"],
-        "noise tuned alone": numbers["peers"]["noise_alone_rmse_m"],
-        "closed form": numbers["peers"]["closed_form_rmse_m"],
-        "true calibration and noise": numbers["peers"]["all_true_rmse_m"],
-    }
-    for row in numbers["rows"]:
-        reference = row["known_calibration_rmse_m"]
-        bars["true calibration, " + row["loss"]] = reference
-        bars["tuned, " + row["loss"]] = row["heldout_ratio"][1] * reference
-    right.barh(list(bars), [100 * x for x in bars.values()], color=common.SKY)
-    for place, value in enumerate(bars.values()):
-        right.text(100 * value, place, f" {100 * value:.2f}", va="center")
-    right.set(xlabel="held-out position RMSE [cm], of the worst start", xscale="log")
-    figure.savefig(path)
 
 
 @common.report_errors(NAME)

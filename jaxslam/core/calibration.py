@@ -126,7 +126,7 @@ def scale_increments(calibration: Calibration, odometry: Any, *, wheel_base: flo
     """
     xp = odometry.__array_namespace__()
     turn = odometry[..., 2]
-    chord = _rotate(odometry[..., :2], -turn / 2) / xp.sinc(turn / (2 * np.pi))[..., None]
+    chord = along_arc(odometry)
     base = wheel_base**2 * calibration.distance_scale / calibration.turn_scale / 4
     per_turn = calibration.turn_per_distance * base
     along = calibration.distance_scale * chord[..., 0] + per_turn * turn
@@ -135,6 +135,16 @@ def scale_increments(calibration: Calibration, odometry: Any, *, wheel_base: flo
     straight = xp.stack([along, sideways], axis=-1) * xp.sinc(turned / (2 * np.pi))[..., None]
     moved = _rotate(straight, turned / 2)
     return xp.concat([moved, turned[..., None]], axis=-1)
+
+
+def along_arc(increments: Any) -> Any:
+    """Motion (..., 2) [m] ahead and to the left along the arcs of increments (..., 3).
+
+    An arc is longer than its chord by (turn / 2) / sin(turn / 2), and leads along turn / 2.
+    """
+    turn = increments[..., 2]
+    chord = _rotate(increments[..., :2], -turn / 2)
+    return chord / increments.__array_namespace__().sinc(turn / (2 * np.pi))[..., None]
 
 
 def _shift(odometry: Any, times: Any, offset: Any) -> Any:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam.core.calibration import Calibration, calibrate_odometry
+from jaxslam.core.calibration import Calibration, along_arc, calibrate_odometry
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.measurement import ScanMatch
 from jaxslam.core.se2_np import compose, dead_reckoning, relative
@@ -193,9 +193,7 @@ def wheel_frame(odometry: np.ndarray, mount: np.ndarray, usable: np.ndarray) -> 
     if not len(of_robot):
         return np.array(mount, np.float64)
     turn = of_robot[:, 2]
-    half, arc = -turn / 2, 1.0 / np.sinc(turn / (2 * np.pi))  # along the arc, as its length
-    ahead = arc * (np.cos(half) * of_robot[:, 0] - np.sin(half) * of_robot[:, 1])
-    sideways = arc * (np.sin(half) * of_robot[:, 0] + np.cos(half) * of_robot[:, 1])
+    ahead, sideways = along_arc(of_robot).T
     by, weight = np.stack([turn, -ahead], axis=1), np.ones(len(turn))
     for _ in range(IRLS_ITERATIONS):  # with the Cauchy kernel
         (lever, tan), *_ = np.linalg.lstsq(by * weight[:, None], weight * sideways, rcond=None)

@@ -22,17 +22,14 @@ from jaxslam.core.calibration import Calibration, calibrate_odometry
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import check_type
-from jaxslam.filtering import slam_filter
 from jaxslam.filtering.belief import Belief
-from jaxslam.filtering.config import FilterConfig
-from jaxslam.filtering.config import init as initial_belief
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import EPISODE_BATCH
 from jaxslam.tuning.model import Model
 from jaxslam.tuning.priors import Prior
-from jaxslam.tuning.slam_model import SlamCheck
+from jaxslam.tuning.slam_model import SlamCheck, SlamInit, SlamStep
 
 SHAPES = {"mount": (3,)}  # of fields that are no scalars
 
@@ -60,25 +57,15 @@ def default_prior() -> CalibratedParams:
     return CalibratedParams(*cast(Any, (None, Calibration(*cast(Any, own)))))
 
 
-class _Init(NamedTuple):
-    """`Model.init`: at the first true pose of the scanner, without a map."""
-
-    config: FilterConfig
-
-    def __call__(self, params: CalibratedParams, episode: Episode) -> Belief:
-        del params
-        return initial_belief(self.config, episode.truth[0])
-
-
 class _Step(NamedTuple):
-    """`Model.step`: one step of `slam_filter`."""
+    """`Model.step`: that of the SLAM filter, by the noise."""
 
-    config: FilterConfig
+    noise: SlamStep
 
     def __call__(
         self, params: CalibratedParams, belief: Belief, now: Measurement
     ) -> tuple[Belief, StepInfo]:
-        return slam_filter.step(self.config, params.noise, belief, now)
+        return cast(Any, self.noise)(params.noise, belief, now)
 
 
 class _Inputs(NamedTuple):
@@ -166,6 +153,7 @@ def calibrated_slam_model(
 def _model(config: Config, scan_period: float | None, wheel_base: float) -> Model:
     """`calibrated_slam_model`, the same object for the same arguments."""
     own = config.filter
-    functions = _Init(own), _Step(own), _Inputs(scan_period, wheel_base), _Check(SlamCheck(own))
+    inputs = _Inputs(scan_period, wheel_base)
+    functions = SlamInit(own), _Step(SlamStep(own)), inputs, _Check(SlamCheck(own))
     # mypy does not see that a NamedTuple can be called.
     return Model(*cast(Any, functions))._replace(batch_size=EPISODE_BATCH)

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -20,6 +20,8 @@ XLA_FLAGS = {
     # By default XLA splits operations among the threads of all devices, and these are short.
     "--xla_disable_hlo_passes": "cpu-parallel-task-assigner",
 }
+
+QUICK = {"xla_cpu_use_fusion_emitters": False}  # XLA's older code generator
 
 
 def use_cpu_devices(num_devices: int | None = None) -> None:
@@ -94,13 +96,16 @@ class DeviceMap:
     All processes must call it with the same arguments, and all get the whole result.
     """
 
-    def __init__(self, function: Callable, *, size: int, static: int = 0):
+    def __init__(
+        self, function: Callable, *, size: int, static: int = 0, compile_quickly: bool = False
+    ):
         """Wrap a function of one item.
 
         Args:
             function: Of `static` hashable arguments, one record common to all items, and one item.
             size: Items of a batch; a single one is not vectorised.
             static: Number of leading arguments that are static under jit.
+            compile_quickly: Compile with `quick_options`, for large programs of small operations.
 
         Raises:
             ValueError: `size` is below 1, or `static` below 0.
@@ -112,6 +117,7 @@ class DeviceMap:
         self.size = size
         self._function = function
         self._static = static
+        self._quick = compile_quickly
 
     def __call__(self, *args: Any, devices: Sequence[jax.Device] | None = None) -> Any:
         """Results of the function, as NumPy arrays that lead with the number of items.
@@ -156,10 +162,11 @@ class DeviceMap:
         batches_of = [[batch_on(d, k * rounds + r) for r in range(rounds)] for k, d in local]
 
         program = self._function, *static
-        _compile(program, common_of, [batches[0] for batches in batches_of])
+        run = _runner(self._quick)
+        _compile(run, program, common_of, [batches[0] for batches in batches_of])
         # Dispatch is asynchronous: one batch of every device after the other, so that none idles.
         results = [
-            [_run(program, *own) for own in zip(common_of, batches, strict=True)]
+            [run(program, *own) for own in zip(common_of, batches, strict=True)]
             for batches in zip(*batches_of, strict=True)
         ]
 
@@ -171,21 +178,50 @@ class DeviceMap:
         return finish
 
 
-def _compile(program: tuple, common_of: list[Any], batch_of: list[Any]) -> None:
+@cache
+def quick_options() -> dict[str, Any]:
+    """Options of XLA with which large programs for CPUs compile in half the time.
+
+    They take XLA's older code generator for fused operations. What it compiles is equal to
+    rounding; where most operations are small, as in a filter, it is as fast.
+
+    Returns:
+        The options; none on other platforms, where this jaxlib does not know them, and where
+        XLA_FLAGS sets one.
+    """
+    present = os.environ.get("XLA_FLAGS", "")
+    if jax.default_backend() != "cpu" or any(name in present for name in QUICK):
+        return {}
+    try:
+        jax.jit(lambda: np.float32(0), compiler_options=QUICK).lower().compile()
+    except RuntimeError:  # an option that this jaxlib does not know
+        return {}
+    return QUICK
+
+
+@cache
+def _runner(quick: bool) -> trace_cache.CachedJit:
+    """`_run`, jitted."""
+    options = quick_options() if quick else None
+    return trace_cache.jit(_run, static_argnames="program", compiler_options=options or None)
+
+
+def _compile(
+    run: trace_cache.CachedJit, program: tuple, common_of: list[Any], batch_of: list[Any]
+) -> None:
     """Compile `_run` for each device, in parallel: XLA does not hold Python's lock.
 
     Tracing and lowering do, and come first. The programs stay in JAX's cache, where the calls of
     `_run` find them.
     """
     lowered = [
-        _run.trace(program, common, batch).lower()
+        run.trace(program, common, batch).lower()
         for common, batch in zip(common_of, batch_of, strict=True)
     ]
     with ThreadPoolExecutor(min(len(lowered), num_cores())) as pool:
         list(pool.map(lambda each: each.compile(), lowered))
 
 
-@partial(trace_cache.jit, static_argnames="program")
 def _run(program: tuple, common: Any, items: Any) -> Any:
     """Results of one batch, arrays that lead with its size; a single item is not vectorised.
 

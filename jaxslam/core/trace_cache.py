@@ -107,12 +107,15 @@ class _Key(NamedTuple):
 class CachedJit:
     """A jitted function with a persistent trace; made by `jit`."""
 
-    def __init__(self, function: Callable, static: tuple[str, ...]):
+    def __init__(self, function: Callable, static: tuple[str, ...], options: dict | None = None):
         """Wrap a function, whose arguments with names in `static` are static."""
         self._function = function
         self._static = static
+        self._options = options
         self._signature = inspect.signature(function)
-        self._plain: jax.stages.Wrapped = jax.jit(function, static_argnames=static)
+        self._plain: jax.stages.Wrapped = jax.jit(
+            function, static_argnames=static, compiler_options=options
+        )
         self._programs: dict[_Key, jax.stages.Wrapped | None] = {}
         update_wrapper(self, function)
 
@@ -171,7 +174,7 @@ class CachedJit:
             return exported.call(arrays)
 
         program.__name__ = self._function.__name__
-        return jax.jit(program)
+        return jax.jit(program, compiler_options=self._options)
 
     def _export(self, key: _Key) -> export.Exported:
         """Trace the function, as a program of one dictionary: its arguments that are not static."""
@@ -183,7 +186,12 @@ class CachedJit:
         return export.export(jax.jit(of_arrays))(jax.tree.unflatten(key.treedef, key.avals))
 
 
-def jit(function: Callable, *, static_argnames: str | tuple[str, ...] = ()) -> CachedJit:
+def jit(
+    function: Callable,
+    *,
+    static_argnames: str | tuple[str, ...] = (),
+    compiler_options: dict[str, Any] | None = None,
+) -> CachedJit:
     """`jax.jit` with a trace that outlives the process; see the module's docstring.
 
     It is plain `jax.jit` within other traced programs (under `jax.vmap`, `jax.grad` or `jax.jit`),
@@ -194,9 +202,11 @@ def jit(function: Callable, *, static_argnames: str | tuple[str, ...] = ()) -> C
         function: A function of this package that depends on nothing but its arguments and the
             package's sources.
         static_argnames: Names of its static arguments.
+        compiler_options: Options of XLA for these programs, as `jax.jit` takes them; a function
+            with any cannot be called within other traced programs.
     """
     names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
-    return CachedJit(function, tuple(names))
+    return CachedJit(function, tuple(names), compiler_options)
 
 
 def _common_device(leaves: list[Any]) -> jax.Device | None:

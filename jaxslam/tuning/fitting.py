@@ -113,7 +113,7 @@ def _value_and_gradient(
 @cache
 def _over_devices(function: Callable[..., Any], batch_size: int) -> DeviceMap:
     """A function of one sequence over many; the same object for the same arguments."""
-    return DeviceMap(function, size=batch_size, static=3)
+    return DeviceMap(function, size=batch_size, static=3, compile_quickly=True)
 
 
 def _evaluate(function: Callable[..., Any], problem: Problem) -> Any:

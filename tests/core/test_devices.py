@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core.devices import DeviceMap, _run, use_cpu_devices
+from jaxslam.core import devices
+from jaxslam.core.devices import DeviceMap, _runner, quick_options, use_cpu_devices
 
 
 def assert_same(one, two):
@@ -50,7 +51,7 @@ def test_single_items_are_not_vectorised():
         return jax.lax.cond(item > 0, lambda: common, lambda: -common)
 
     for size, word in [(1, "cond"), (2, "select")]:
-        program = _run.trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr
+        program = _runner(False).trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr
         assert word in str(program)
     assert DeviceMap(signed, size=1)(jnp.float64(2.0), jnp.array([1, 0, 3])).tolist() == [2, -2, 2]
 
@@ -125,3 +126,29 @@ def test_items_may_be_arrays_of_numpy_or_jax(kind):
 def test_impossible_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()
+
+
+def test_what_is_compiled_quickly_is_the_same_to_rounding():
+    items = jnp.linspace(0.0, 3.0, 8)
+    found = [DeviceMap(wave, size=2, compile_quickly=q)(jnp.float64(2.0), items) for q in (0, 1)]
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-14)
+
+
+def wave(common, item):
+    return jnp.sin(common * item) + jnp.exp(-item)
+
+
+def test_options_of_the_compiler_are_none_where_the_user_sets_them(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
+    quick_options.cache_clear()
+    assert quick_options() == {}
+    monkeypatch.undo()
+    quick_options.cache_clear()
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr(devices, "QUICK", {"xla_cpu_no_such_option": False})
+    quick_options.cache_clear()
+    assert quick_options() == {}
+    monkeypatch.undo()
+    quick_options.cache_clear()

@@ -4,8 +4,9 @@ Its wheels are 5 % too large and 3 % too small and 4 % further apart than its od
 scanner is 25 cm ahead of where it is taken to be and turned by 3 degrees, and its clocks are 80 ms
 apart (`calibration_drives.HURT`). Noise and calibration are tuned together, by the innovations'
 likelihood, which needs no truth, and by the likelihood of the true poses. Peers: the noise alone,
-and the closed form of Censi et al. on the true motion of the scanner. The same command resumes
-where it was stopped.
+and the closed form of Censi et al. on the true motion of the scanner. Then recorded logs of the
+same robot, which calibrate themselves by their scans (`calibration_scans`). The same command
+resumes where it was stopped.
 """
 
 import sys
@@ -18,7 +19,7 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
-from experiments import calibration_drives, common
+from experiments import calibration_drives, calibration_scans, common
 from experiments.calibration_drives import CONFIG, HURT
 from experiments.calibration_picture import NOISE_NUMBERS, draw
 from experiments.closed_form_calibration import closed_form
@@ -281,10 +282,17 @@ def straight(seed: int, num_scans: int) -> common.Numbers:
     return _errors(LOSSES[0], CalibratedParams(noise, robot.calibration()), drives)
 
 
+def logs_by_scans(seed: int, count: int, cache: common.ResultCache) -> common.Numbers:
+    """What `count` recorded logs say of their robot by their scans alone."""
+    make = [partial(calibration_scans.recover, seed, number) for number in range(count)]
+    each = tqdm(make, unit="log", leave=False)
+    return calibration_scans.summary([cache(f"log {k}", own) for k, own in enumerate(each)])
+
+
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    sizes = {"starts": 20, "runs": 64, "heldout": 32, "repetitions": 40}
+    sizes = {"starts": 20, "runs": 64, "heldout": 32, "repetitions": 40, "logs": 20}
     args = common.parse(__doc__, argv, losses=",".join(LOSSES), **sizes)
     losses = args.losses.split(",")
     if not set(losses) <= set(LOSSES):
@@ -302,6 +310,7 @@ def main(argv: list[str] | None = None) -> int:
     rows = [compute_loss(loss, args.seed, counts, train, test, cache) for loss in losses]
     numbers = {"seed": args.seed, "runs": args.runs, "heldout": args.heldout}
     numbers |= {"rows": rows, "peers": others, "straight": along}
+    numbers["scans"] = scans = logs_by_scans(args.seed, args.logs, cache)
     common.save(args.out, NAME, numbers, draw)
     cache.clear()
     for row in rows:
@@ -316,6 +325,14 @@ def main(argv: list[str] | None = None) -> int:
                 print(f"  {name}: standard error per spread {ratio:.2f}")
     print({key: value for key, value in others.items() if key.endswith("rmse_m")})
     print("straight drives:", *along["warnings"])
+    within, worst = scans["within_3_se"], scans["worst_z"]
+    print(
+        f"logs of scans: {within} of {scans['logs']} within 3 standard errors, largest {worst:.1f}"
+    )
+    for name, error, ratio in zip(
+        scans["names"], scans["rms_error"], scans["error_per_spread"], strict=True
+    ):
+        print(f"  {name}: RMS error {error:.4f}, standard error per spread {ratio:.2f}")
     return 0
 
 

@@ -78,6 +78,32 @@ class Calibration(NamedTuple):
         difference = self.turn_per_distance * base * wheel_base / 2
         return self.distance_scale - difference, self.distance_scale + difference, base
 
+    def without_base(self, wheel_base: float) -> "Calibration":
+        """The calibration that does without `wheel_base` what this one does with it.
+
+        Wheels of different size move the middle between them by s per turn (`scale_increments`).
+        The point of their axle at y to the left of it, which a turn that they report does not move
+        ahead, has
+
+            y = s / turn_scale,   distance_scale' = distance_scale - y turn_per_distance
+
+        A log does not say how far apart the wheels are: what is found from it is of that point.
+
+        Args:
+            wheel_base: [m] between the wheels, as the odometry assumes.
+        """
+        y = self._motion_per_turn(wheel_base) / self.turn_scale
+        xp = self.mount.__array_namespace__()
+        return self._replace(
+            distance_scale=self.distance_scale - y * self.turn_per_distance,
+            mount=self.mount - y * xp.asarray([0.0, 1.0, 0.0], dtype=self.mount.dtype),
+        )
+
+    def _motion_per_turn(self, wheel_base: float) -> AnyArray:
+        """Motion () [m / rad] ahead of the middle between the wheels, per reported rotation."""
+        base = wheel_base**2 * self.distance_scale / self.turn_scale / 4
+        return self.turn_per_distance * base
+
 
 def calibrate_odometry(
     calibration: Calibration,
@@ -127,8 +153,7 @@ def scale_increments(calibration: Calibration, odometry: Any, *, wheel_base: flo
     xp = odometry.__array_namespace__()
     turn = odometry[..., 2]
     chord = along_arc(odometry)
-    base = wheel_base**2 * calibration.distance_scale / calibration.turn_scale / 4
-    per_turn = calibration.turn_per_distance * base
+    per_turn = calibration._motion_per_turn(wheel_base)
     along = calibration.distance_scale * chord[..., 0] + per_turn * turn
     turned = calibration.turn_scale * turn + calibration.turn_per_distance * chord[..., 0]
     sideways = calibration.distance_scale * chord[..., 1]

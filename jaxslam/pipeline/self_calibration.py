@@ -13,7 +13,9 @@ calibration stays the same:
 Then SLAM is run with calibrated odometry. Which systematic error turns a robot about which point
 depends on where its wheels are. A robot on two wheels does not move sideways in the frame between
 them: the poses of a log are those of that frame if they do not, and else it is found from how they
-do (`wheel_frame`).
+do (`wheel_frame`). How far apart they are, no log says; what is found is of the point of their axle
+that a turn does not move ahead, between wheels of equal size the middle
+(`Calibration.without_base`).
 """
 
 from typing import Any, NamedTuple

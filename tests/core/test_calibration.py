@@ -69,6 +69,18 @@ def test_scales_are_exact_for_two_wheels():
     np.testing.assert_allclose(found, arcs(rolled, scales), atol=1e-14)
 
 
+def test_without_the_wheel_base_there_is_a_calibration_that_does_the_same():
+    rolled = np.random.default_rng(4).uniform(-0.2, 0.3, (12, 2))
+    odometry, times = np.array(arcs(rolled)), 0.5 * np.arange(12.0)
+    odometry[0] = 0.0
+    expected = calibrate_odometry(HURT, odometry, times=times, wheel_base=BASE)
+    found = calibrate_odometry(HURT.without_base(BASE), odometry, times=times)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    with_sizes = HURT.without_base(BASE).mount[1] - HURT.mount[1]
+    assert abs(with_sizes - 0.0082) < 1e-4  # (0.97 - 1.05) BASE 1.04 / 4, to the right
+    assert to_jax(HURT).without_base(BASE).mount.dtype == jnp.float64
+
+
 def test_the_scanner_moves_as_its_mount_does():
     """Of a robot at r, a scanner at `TAKEN` (+) mount is at r (+) `TAKEN` (+) mount."""
     odometry, _ = some_odometry()

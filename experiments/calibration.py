@@ -11,12 +11,9 @@ resumes where it was stopped.
 
 import sys
 from functools import partial
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
 from tqdm import tqdm
 
 from experiments import calibration_drives, calibration_scans, common
@@ -34,6 +31,7 @@ from jaxslam.pipeline import episodes
 from jaxslam.simulation.robot import Robot
 from jaxslam.tuning import fitting, parameters, standard_errors
 from jaxslam.tuning.calibrated import CalibratedParams, calibrate_episode, calibrated_slam_model
+from jaxslam.tuning.optimizers import newton
 
 NAME = "calibration"
 LOSSES = ("innovation_nll", "pose_nll")
@@ -46,8 +44,6 @@ FACTOR = 2.0  # within which each noise of a start is off
 STRAIGHT = [(1.0, 1.0), (4.5, 1.0)]
 NUM_STRAIGHT, STRAIGHT_NOISE = 8, 0.001  # drives, [m / sqrt(m)] of the encoders
 UNCALIBRATED_UPDATES, KNOWN_UPDATES = 30, 30
-MAX_CHANGE = 0.4  # of a number in one step of Newton's method
-LEAST_CURVATURE = 1e-4  # of a direction that Newton's method takes, per the largest one
 
 
 def true_params() -> CalibratedParams:
@@ -73,24 +69,6 @@ def approach(loss: str, params: CalibratedParams, train: Episode) -> CalibratedP
         found = fitting.tune(MODEL, params, drives, loss=loss, num_updates=updates, frozen=frozen)
         params = found.params
     return params
-
-
-def newton(hessian: np.ndarray) -> optax.GradientTransformation:
-    """Newton's method with one Hessian (P, P), along the directions that are clearly curved.
-
-    The noise and the calibration are correlated, and a minimum that is missed by a standard error
-    looks like one that is off: L-BFGS takes long for the last of it.
-    """
-    curvature, direction = np.linalg.eigh(hessian)
-    kept = curvature > LEAST_CURVATURE * curvature.max()
-    inverse = jnp.asarray(direction[:, kept] / curvature[kept] @ direction[:, kept].T, float)
-
-    def update(gradient: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        del params
-        change = -(inverse @ gradient)
-        return change * jnp.minimum(1.0, MAX_CHANGE / jnp.max(jnp.abs(change))), state
-
-    return optax.GradientTransformation(lambda _: optax.EmptyState(), update)
 
 
 def hessian_of(loss: str, params: CalibratedParams, train: Episode) -> common.Numbers:

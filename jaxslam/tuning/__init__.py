@@ -16,6 +16,7 @@ from jaxslam.tuning.model import Model as Model
 from jaxslam.tuning.model import run_model as run_model
 from jaxslam.tuning.optimizers import default_optimizer as default_optimizer
 from jaxslam.tuning.optimizers import lbfgs_backtracking as lbfgs_backtracking
+from jaxslam.tuning.optimizers import newton as newton
 from jaxslam.tuning.parameters import param_names as param_names
 from jaxslam.tuning.prediction import ClosureNll as ClosureNll
 from jaxslam.tuning.prediction import NisConsistency as NisConsistency

@@ -9,6 +9,7 @@ calibration stays the same:
         match all scans, with odometry as calibrated so far
         cut the drive into spans between keyframes; leave out those with guessed or lost odometry
         estimate the calibration from the matched motion of the spans (`odometry_calibration`)
+        begin the next round where the last two rounds point to, number by number (secant method)
 
 Then SLAM is run with calibrated odometry. Which systematic error turns a robot about which point
 depends on where its wheels are. A robot on two wheels does not move sideways in the frame between
@@ -34,13 +35,17 @@ from jaxslam.smoothing.odometry_calibration import (
     MotionSpans,
     estimate_calibration,
     flat,
+    unflat,
 )
 
 MAX_ROUNDS = 6
 """Times that all scans are matched, at most."""
 
 CONVERGED = 0.2
-"""Standard errors by which no number changes any more in the last round."""
+"""Standard errors by which no number changes any more in the last round, or by more rounds."""
+
+LEAST_GONE = 0.2
+"""Share of its error that a round is taken to remove from a number, at least."""
 
 MATCH_STD_SCALE = 0.3
 """Factor on the standard deviation that scan matching states, as of `NoiseParams`."""
@@ -104,20 +109,39 @@ def calibrate_log(
     odometry, is_share, _ = _shared(given)
     guessed = _guessed(given) | is_share
     taken = wheel_frame(odometry, log.mount, ~guessed) if mount is None else np.asarray(mount)
-    times, before = usable_times(log.times), flat(calibration)
-    num_rounds, change = 0, np.full(len(before), np.inf)
-    limit = np.zeros(len(before))
-    while num_rounds < MAX_ROUNDS and np.any(change > limit):
-        num_rounds += 1
+    times, start = usable_times(log.times), flat(calibration)
+    rounds: list[tuple[np.ndarray, np.ndarray]] = []
+    is_settled = False
+    while len(rounds) < MAX_ROUNDS and not is_settled:
+        calibration = unflat(start)
         moved = calibrate_odometry(calibration, odometry, times=times, mount=taken)
         matches = online.match_log(given.config, moved, given.scans, odometry_guessed=guessed)
         spans = motion_spans(given, odometry, matches, guessed, times, taken)
         estimate = estimate_calibration(spans, mean, prior_std)
-        calibration = estimate.calibration
-        change, before = np.abs(flat(calibration) - before), flat(calibration)
+        rounds.append((start, flat(estimate.calibration) - start))
+        left = left_over(rounds)
         limit = CONVERGED * flat(estimate.standard_errors)
-    is_settled = bool(np.all(change <= limit))
-    return LogCalibration(estimate, taken, num_rounds, spans, is_settled)
+        is_settled = bool(np.all(np.abs(rounds[-1][1]) <= limit) and np.all(np.abs(left) <= limit))
+        start = flat(estimate.calibration) + left
+    return LogCalibration(estimate, taken, len(rounds), spans, is_settled)
+
+
+def left_over(rounds: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """How far (K,) each number is from its limit after the last round, by the last two.
+
+    A round takes a number from x to x + f(x), and leaves a share r of its error. By two of them,
+
+        1 - r = -(f1 - f0) / (x1 - x0),    left over after x1 + f1:  f1 r / (1 - r)
+
+    Args:
+        rounds: Of each, where it began (K,) and by how much it changed that (K,).
+    """
+    if len(rounds) < 2:
+        return np.zeros_like(rounds[-1][1])
+    (x0, f0), (x1, f1) = rounds[-2:]
+    gone = np.where(x1 == x0, 1.0, (f0 - f1) / np.where(x1 == x0, 1.0, x1 - x0))
+    gone = np.clip(gone, LEAST_GONE, 1.0)
+    return f1 * (1.0 - gone) / gone
 
 
 def calibrated(

@@ -66,6 +66,20 @@ def test_scans_without_wheels_are_refused():
         self_calibration.require_wheels(log, "scans-only")
 
 
+def test_rounds_that_close_in_slowly_are_cut_short():
+    share, end = np.array([0.0, 0.5, 0.7]), np.array([1.0, -2.0, 3.0])
+    x0 = np.zeros(3)
+    f0 = (1 - share) * (end - x0)
+    x1 = x0 + f0
+    f1 = (1 - share) * (end - x1)
+    np.testing.assert_allclose(x1 + f1 + self_calibration.left_over([(x0, f0), (x1, f1)]), end)
+    np.testing.assert_array_equal(self_calibration.left_over([(x0, f0)]), 0.0)
+    apart = self_calibration.left_over([(x0, f0), (x1, -f0)])  # these rounds do not close in
+    assert np.all(np.abs(apart) <= 4 * np.abs(f0))
+    held = self_calibration.left_over([(x0, 0 * f0), (x0, 0 * f0)])
+    np.testing.assert_array_equal(held, 0.0)
+
+
 @pytest.fixture(scope="module")
 def office_log():
     """A drive through the office by a robot that is off; and the true poses of its scanner."""

@@ -131,6 +131,9 @@ def tune(
     check_range("--seed", seed, 0, 2**32 - 1)
     check_range("--batch", 1 if batch is None else batch, 1, 10**6)
     check_range("--patience", 1 if patience is None else patience, 1, 10**6)
+    if patience is not None and not (test if logs else heldout):
+        advice = "name some by --test, or give simulated ones by --heldout"
+        raise InputError("needs held-out runs", field="--patience", advice=advice)
     if noise is not None and noise.resolve() == (out / PARAMS_FILE).resolve():
         advice = "name another folder by --out"
         raise InputError("would be replaced by the result", path=noise, advice=advice)

@@ -86,6 +86,8 @@ def consistency_report(
     if (errors is None) != (error_covariances is None):
         missing = "errors" if errors is None else "error_covariances"
         raise ValueError(f"{missing} is missing: errors and error_covariances go together")
+    if errors is None and error_mask is not None:
+        raise ValueError("errors is missing: error_mask is of them")
     nees = nees_dof = None
     if errors is not None:
         nees, nees_dof, _ = normalise(
@@ -157,7 +159,10 @@ def check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
         return tuple(f"component {k}" for k in range(count))
     if isinstance(names, str) or len(names) != count:
         raise ValueError(f"names is {names!r}, not a name for each of {count} components")
-    return tuple(map(str, names))
+    texts = tuple(map(str, names))
+    if len(set(texts)) < count:
+        raise ValueError(f"names is {names!r}: two components have one name")
+    return texts
 
 
 def normal_scores(fit: ChiSquareFit) -> np.ndarray:

@@ -77,6 +77,8 @@ def normalise(
     cov = np.where(both, cov, np.eye(size))
     root = _cholesky(cov_name, mask_name, cov)
     w = np.linalg.solve(root, v[..., None])[..., 0]
+    with np.errstate(over="ignore"):
+        _check_finite(f"the square of {name}", mask_name, w**2, has)
     return np.sum(w**2, axis=-1), has.sum(axis=-1), np.where(has, w, np.nan)
 
 

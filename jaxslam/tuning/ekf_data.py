@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxslam.core.types import Array, as_numpy, check_array, check_type
+from jaxslam.core.types import AnyArray, as_numpy, check_array, check_type
 from jaxslam.tuning.model import as_arrays
 
 
@@ -22,8 +22,8 @@ class EkfSequence(NamedTuple):
     """
 
     inputs: Any
-    measurements: Array
-    mask: Array | None = None
+    measurements: AnyArray
+    mask: AnyArray | None = None
     truth: Any = None
 
 
@@ -66,8 +66,7 @@ def as_sequences(data: Any, name: str) -> EkfSequence:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             at = np.argwhere(~np.isfinite(array))[0].tolist()
             raise ValueError(f"{own}{at} is {array[tuple(at)]}: inputs are known at all steps")
-    arrays = as_arrays(None, data._replace(measurements=y, mask=mask), name)[1]
-    return arrays  # type: ignore[no-any-return]  # the tree that was given
+    return as_arrays(None, data._replace(measurements=y, mask=mask), name)[1]
 
 
 def stack_sequences(sequences: Sequence[EkfSequence], name: str = "data") -> EkfSequence:

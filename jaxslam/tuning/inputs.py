@@ -144,7 +144,7 @@ def check_alike(data: Any, heldout: Any) -> None:
     differ.
     """
     if not (isinstance(data, Episode) and isinstance(heldout, Episode)):
-        if jax.tree.structure(data) != jax.tree.structure(heldout):
+        if str(jax.tree.structure(data)) != str(jax.tree.structure(heldout)):
             wanted, found = (", ".join(sorted(_fields(each)))[:200] for each in (data, heldout))
             raise ValueError(
                 f"heldout is {found or 'one array'}, not {wanted or 'one array'} as the data to "

@@ -45,6 +45,10 @@ class ConsistencyReport(NamedTuple):
     verdicts: tuple[str, ...]
     consistent: bool
 
+    def __str__(self) -> str:
+        """The findings, a line each."""
+        return "\n".join(self.verdicts)
+
 
 def consistency_report(
     innovations: Any,
@@ -61,7 +65,7 @@ def consistency_report(
 
     Args:
         innovations: (T, m) or (B, T, m) measurement minus prediction, angles wrapped, of B
-            independent trials.
+            independent trials; or columns (..., m, 1), with a covariance for each.
         covariances: (..., m, m) their covariances S as the filter states them; or one (m, m).
         mask: (..., m) bool, numbers that were measured, or (...), steps; by default all. What is
             left out may be NaN. A series is tested for whiteness over those that are left.

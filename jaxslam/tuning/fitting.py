@@ -277,8 +277,9 @@ def tune(
     else:
         check_state(state, start)
         first = state.theta_history[0]
-        own = _with_prior(*mean_gradient(*evaluate(first, 0))[:2], penalty, weight, first)[0]
-        check_loss_of_state(state, own)
+        each = evaluate(first, 0)
+        own = _with_prior(*mean_gradient(*each)[:2], penalty, weight, first)[0]
+        check_loss_of_state(state, own, _finite_mean(np.abs(each[0])))
 
     while state.step <= num_updates and not stalled(state, patience):
         step = int(state.step)

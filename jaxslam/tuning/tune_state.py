@@ -107,10 +107,16 @@ def check_state(state: TuneState, start: TuneState) -> None:
         raise ValueError("state is of a tuning that began with other params or transforms")
 
 
-def check_loss_of_state(state: TuneState, value: float) -> None:
-    """Raise ValueError unless the first loss of a state is that of the tuning, to rounding."""
+def check_loss_of_state(state: TuneState, value: float, size: float) -> None:
+    """Raise ValueError unless the first loss of a state is that of the tuning, to rounding.
+
+    Args:
+        state: Of an earlier call.
+        value: The loss of the tuning's first evaluation.
+        size: Mean absolute loss of its sequences.
+    """
     first = float(state.loss[0])
-    if state.step > 0 and np.isfinite(first) and abs(value - first) > LOSS_ROUNDING * abs(first):
+    if state.step > 0 and np.isfinite(first) and not abs(value - first) <= LOSS_ROUNDING * size:
         raise ValueError(
             f"state is of another model, data, loss, prior or seed: its first loss is {first:.6g}, "
             f"not {value:.6g}"

@@ -263,6 +263,8 @@ def test_one_trial_needs_no_axis_and_lists_will_do():
     v, S, _, _ = kalman(9, trials=1, steps=30)
     one = report_metrics(consistency_report(v[0].tolist(), S[0].astype(np.float64)))
     assert one == report_metrics(consistency_report(v, S))
+    columns = consistency_report(v[0, ..., None], S[0]), consistency_report(v[..., None], S)
+    assert all(report_metrics(report) == one for report in columns)
     few = consistency_report([[0.3], [-0.1]], [[1.0]])
     assert few.consistent and few.nis.num_values == 2
     single = consistency_of_nis([1.0], 1)
@@ -321,6 +323,7 @@ def test_a_few_giant_innovations_do_not_hide_in_the_scatter_that_they_make():
     turned = v.copy()
     turned[0, ::50, 1] += 2 * np.pi
     found = consistency_report(turned, S)
+    assert str(found).splitlines() == list(found.verdicts)
     assert not found.consistent and abs(found.nis.score) < 3.0
     (verdict,) = (line for line in found.verdicts if "outliers" in line)
     worst = int(np.argmax(found.nis.values))

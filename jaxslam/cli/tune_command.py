@@ -39,6 +39,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors, tune_state
 from jaxslam.tuning.losses import Loss
+from jaxslam.tuning.problem import StartError
 from jaxslam.tuning.tune_state import TuneResult, TuneState
 
 PARAMS_FILE, CHECKPOINT_FILE = "noise.json", "tune.npz"
@@ -222,7 +223,11 @@ def _tune(job: TuneJob, out: Path, settings: _Settings) -> TuneResult:
         bar.set_postfix(postfix, refresh=False)
         bar.update(done - bar.n)
 
-    with _resumable(out, lambda: done and f"{done} of {num_updates + 1} evaluations"), bar:
+    with (
+        _resumable(out, lambda: done and f"{done} of {num_updates + 1} evaluations"),
+        bar,
+        _name_start(job.title),
+    ):
         return fitting.tune(
             job.config,
             job.params,
@@ -237,6 +242,15 @@ def _tune(job: TuneJob, out: Path, settings: _Settings) -> TuneResult:
             state=state,
             callback=save,
         )
+
+
+@contextmanager
+def _name_start(title: str) -> Iterator[None]:
+    """Let a tuning that has nothing to minimise end in an InputError that names its data."""
+    try:
+        yield
+    except StartError as error:
+        raise InputError(str(error), field=title) from None
 
 
 @contextmanager

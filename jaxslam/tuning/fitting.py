@@ -30,6 +30,7 @@ from jaxslam.tuning.optimizers import check_optimizer, default_optimizer
 from jaxslam.tuning.parameters import constrain, theta_tree, trainable_mask, unconstrain
 from jaxslam.tuning.parameters import unflatten_params as unflatten_params
 from jaxslam.tuning.priors import FlatPrior, flatten_prior
+from jaxslam.tuning.problem import NOT_FINITE, StartError, check_start
 from jaxslam.tuning.problem import Problem as Problem
 from jaxslam.tuning.problem import as_model as as_model
 from jaxslam.tuning.problem import prepare as prepare
@@ -41,10 +42,6 @@ from jaxslam.tuning.tune_state import init as init
 from jaxslam.tuning.tune_state import result as result
 
 Transforms = tuple[Transform, ...]
-NOT_FINITE = (
-    "look for numbers in the data that are not finite or too large, covariances that are not "
-    "positive definite, and parameters to start from that are far off"
-)
 
 
 def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any) -> Array:
@@ -131,29 +128,6 @@ def mean_gradient(values: np.ndarray, each: np.ndarray) -> tuple[float, np.ndarr
     if not good.any():
         return np.nan, np.zeros(each.shape[1]), len(good)
     return values[good].mean(), each[good].mean(axis=0), int(np.sum(~good))
-
-
-def check_start(
-    values: np.ndarray, each: np.ndarray, trainable: np.ndarray, *, alone: bool = True
-) -> None:
-    """Raise ValueError unless there is something to minimise where the tuning starts.
-
-    Args:
-        values: (B,) losses.
-        each: (B, P) gradients.
-        trainable: (P,) bool, which parameters are tuned.
-        alone: Whether nothing but the data says what the parameters are.
-    """
-    good = np.isfinite(values) & np.isfinite(each).all(axis=1)
-    if not good.any():
-        raise ValueError(
-            f"the loss and gradient of none of {len(good)} sequences are finite; {NOT_FINITE}"
-        )
-    if alone and not each[good][:, trainable].any():
-        raise ValueError(
-            "the loss depends on no parameter that is tuned: its gradient is 0; is there anything "
-            "in the data that the loss compares, and does the model use its parameters?"
-        )
 
 
 def draw_batch(seed: int, step: int, num_episodes: int, batch_size: int) -> np.ndarray:
@@ -294,7 +268,7 @@ def tune(
             now = problem._replace(params=current, data=validation, theta=state.theta)
             heldout_loss = _finite_mean(values_of(now))
             if step == 0 and not np.isfinite(heldout_loss):
-                raise ValueError(f"heldout: the loss of no sequence is finite; {NOT_FINITE}")
+                raise StartError(f"heldout: the loss of no sequence is finite; {NOT_FINITE}")
         state = record(state, value, heldout_loss, skipped)
         state = _update_theta(state, optimizer, value, gradient, trainable)
         if callback is not None:

@@ -15,6 +15,15 @@ from jaxslam.tuning.model_checks import check_model
 from jaxslam.tuning.slam_model import SlamCheck, as_model
 from jaxslam.tuning.transforms import Transform, of_leaves
 
+NOT_FINITE = (
+    "look for numbers in the data that are not finite or too large, covariances that are not "
+    "positive definite, and parameters to start from that are far off"
+)
+
+
+class StartError(ValueError):
+    """There is nothing to minimise where a tuning starts; known after the first evaluation."""
+
 
 class Problem(NamedTuple):
     """What is tuned, checked.
@@ -72,3 +81,26 @@ def prepare(
     function = default_loss(stacked) if loss is None else resolve(loss)
     check_loss(function, stacked, name=name)
     return Problem(model_for(function, model), function, used, arrays, stacked)
+
+
+def check_start(
+    values: np.ndarray, each: np.ndarray, trainable: np.ndarray, *, alone: bool = True
+) -> None:
+    """Raise StartError unless there is something to minimise where the tuning starts.
+
+    Args:
+        values: (B,) losses.
+        each: (B, P) gradients.
+        trainable: (P,) bool, which parameters are tuned.
+        alone: Whether nothing but the data says what the parameters are.
+    """
+    good = np.isfinite(values) & np.isfinite(each).all(axis=1)
+    if not good.any():
+        raise StartError(
+            f"the loss and gradient of none of {len(good)} sequences are finite; {NOT_FINITE}"
+        )
+    if alone and not each[good][:, trainable].any():
+        raise StartError(
+            "the loss depends on no parameter that is tuned: its gradient is 0; is there anything "
+            "in the data that the loss compares, and does the model use its parameters?"
+        )

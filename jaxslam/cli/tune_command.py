@@ -39,6 +39,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json
 from jaxslam.tuning import fitting, losses, optimizers, parameters, standard_errors, tune_state
 from jaxslam.tuning.losses import Loss
+from jaxslam.tuning.problem import StartError
 from jaxslam.tuning.tune_state import TuneResult, TuneState
 
 PARAMS_FILE, CHECKPOINT_FILE = "noise.json", "tune.npz"
@@ -131,6 +132,9 @@ def tune(
     check_range("--seed", seed, 0, 2**32 - 1)
     check_range("--batch", 1 if batch is None else batch, 1, 10**6)
     check_range("--patience", 1 if patience is None else patience, 1, 10**6)
+    if patience is not None and not (test if logs else heldout):
+        advice = "name some by --test, or give simulated ones by --heldout"
+        raise InputError("needs held-out runs", field="--patience", advice=advice)
     if noise is not None and noise.resolve() == (out / PARAMS_FILE).resolve():
         advice = "name another folder by --out"
         raise InputError("would be replaced by the result", path=noise, advice=advice)
@@ -219,7 +223,11 @@ def _tune(job: TuneJob, out: Path, settings: _Settings) -> TuneResult:
         bar.set_postfix(postfix, refresh=False)
         bar.update(done - bar.n)
 
-    with _resumable(out, lambda: done and f"{done} of {num_updates + 1} evaluations"), bar:
+    with (
+        _resumable(out, lambda: done and f"{done} of {num_updates + 1} evaluations"),
+        bar,
+        _name_start(job.title),
+    ):
         return fitting.tune(
             job.config,
             job.params,
@@ -234,6 +242,15 @@ def _tune(job: TuneJob, out: Path, settings: _Settings) -> TuneResult:
             state=state,
             callback=save,
         )
+
+
+@contextmanager
+def _name_start(title: str) -> Iterator[None]:
+    """Let a tuning that has nothing to minimise end in an InputError that names its data."""
+    try:
+        yield
+    except StartError as error:
+        raise InputError(str(error), field=title) from None
 
 
 @contextmanager

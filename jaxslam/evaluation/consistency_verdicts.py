@@ -73,7 +73,10 @@ def verdicts_of(
     if found:
         return tuple(found), False
     parts = [_mean_text("NIS", nis), *([] if nees is None else [_mean_text("NEES", nees)])]
-    parts += [] if white is None else ["innovations are white, without bias"]
+    if white is not None:
+        tested = np.isfinite(white.ljung_box_p)
+        parts += [f"innovations are {'white, ' if tested else ''}without bias"]
+        parts += [] if tested else ["too few to say whether they are white"]
     return (f"consistent: {'; '.join(parts)}",), True
 
 
@@ -88,8 +91,10 @@ def _mean_text(name: str, fit: ChiSquareFit) -> str:
 
 def _bias_scores(white: Whiteness) -> np.ndarray:
     """Whether the mean of each series (m,) is significant; False where it is not known."""
+    # Numbers that are all the same have no scatter; white ones would have that of 1 / sqrt(N).
+    least = 1.0 / np.sqrt(np.maximum(white.num_values, 1))
     return np.abs(white.mean) > SIGNIFICANT * np.where(
-        white.mean_std_error > 0.0, white.mean_std_error, np.inf
+        white.mean_std_error > 0.0, white.mean_std_error, least
     )
 
 
@@ -197,8 +202,10 @@ def _bias_lines(white: Whiteness | None, biased: np.ndarray) -> list[str]:
 
 def _shape_lines(fit: ChiSquareFit, name: str) -> list[str]:
     """A distribution that is not chi-square, where the mean alone does not show it."""
-    if abs(fit.score) >= SIGNIFICANT or fit.ks_p >= P_VALUE:
+    if abs(fit.score) >= SIGNIFICANT:
         return []
+    if fit.ks_p >= P_VALUE:
+        return _outlier_lines(fit, name)
     known = fit.pit[fit.dof > 0]
     tail = (1.0 - LEVEL) / 2.0
     low, high = np.mean(known < tail), np.mean(known > 1.0 - tail)
@@ -209,6 +216,24 @@ def _shape_lines(fit: ChiSquareFit, name: str) -> list[str]:
     else:
         cause = f"{low:.1%} below and {high:.1%} above the {LEVEL:.0%} interval"
     return [f"{name} is not chi-square distributed (distance {fit.ks:.2f}): {cause}"]
+
+
+def _outlier_lines(fit: ChiSquareFit, name: str) -> list[str]:
+    """Single values that chi-square does not have: they also hide in the scatter of the mean."""
+    from scipy.stats import chi2  # imported here, because it is slow to import
+
+    above = np.where(fit.dof > 0, chi2.sf(fit.values, np.maximum(fit.dof, 1)), 1.0)
+    wrong = above < P_VALUE / fit.num_values  # of so many, one is beyond with this probability
+    if not wrong.any():
+        return []
+    worst = np.unravel_index(np.nanargmax(np.where(wrong, fit.values, np.nan)), wrong.shape)
+    where = worst[1:] if len(fit.values) == 1 else worst
+    at = ", ".join(str(int(k)) for k in where)
+    return [
+        f"{wrong.sum()} of {fit.num_values} steps are outliers: {name} is {fit.values[worst]:.3g} "
+        f"at step [{at}], of {fit.dof[worst]} dof; wrong measurements, or angles that are not "
+        "wrapped"
+    ]
 
 
 def _time_lines(white: Whiteness | None, nis_white: Whiteness) -> list[str]:

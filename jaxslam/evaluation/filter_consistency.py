@@ -45,6 +45,10 @@ class ConsistencyReport(NamedTuple):
     verdicts: tuple[str, ...]
     consistent: bool
 
+    def __str__(self) -> str:
+        """The findings, a line each."""
+        return "\n".join(self.verdicts)
+
 
 def consistency_report(
     innovations: Any,
@@ -61,7 +65,7 @@ def consistency_report(
 
     Args:
         innovations: (T, m) or (B, T, m) measurement minus prediction, angles wrapped, of B
-            independent trials.
+            independent trials; or columns (..., m, 1), with a covariance for each.
         covariances: (..., m, m) their covariances S as the filter states them; or one (m, m).
         mask: (..., m) bool, numbers that were measured, or (...), steps; by default all. What is
             left out may be NaN. A series is tested for whiteness over those that are left.
@@ -86,6 +90,8 @@ def consistency_report(
     if (errors is None) != (error_covariances is None):
         missing = "errors" if errors is None else "error_covariances"
         raise ValueError(f"{missing} is missing: errors and error_covariances go together")
+    if errors is None and error_mask is not None:
+        raise ValueError("errors is missing: error_mask is of them")
     nees = nees_dof = None
     if errors is not None:
         nees, nees_dof, _ = normalise(
@@ -157,7 +163,10 @@ def check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
         return tuple(f"component {k}" for k in range(count))
     if isinstance(names, str) or len(names) != count:
         raise ValueError(f"names is {names!r}, not a name for each of {count} components")
-    return tuple(map(str, names))
+    texts = tuple(map(str, names))
+    if len(set(texts)) < count:
+        raise ValueError(f"names is {names!r}: two components have one name")
+    return texts
 
 
 def normal_scores(fit: ChiSquareFit) -> np.ndarray:

@@ -50,7 +50,7 @@ def normalise(
 
     Args:
         names: Of the three arguments, for messages.
-        vectors: (T, m) or (B, T, m).
+        vectors: (T, m) or (B, T, m), or columns (..., m, 1) with a covariance for each.
         covariances: (..., m, m), or one (m, m).
         mask: (..., m) or (...) bool; None for all.
 
@@ -62,11 +62,12 @@ def normalise(
         ValueError: As of `filter_consistency.consistency_report`.
     """
     name, cov_name, mask_name = names
-    v = as_float64(name, vectors, (..., "m"))
+    v, cov = as_float64(name, vectors, (..., "m")), as_numpy(cov_name, covariances)
+    if v.ndim == cov.ndim > 2 and v.shape[-1] == 1 and cov.shape[:-1] == v.shape[:-1]:
+        v = v[..., 0]  # columns, as filters of matrices return them
     if v.ndim not in (2, 3) or not v.size:
         raise ValueError(f"{name} has the shape {v.shape}, not (T, m) or (B, T, m) with numbers")
     size = v.shape[-1]
-    cov = as_numpy(cov_name, covariances)
     cov = as_float64(cov_name, cov, (size, size) if cov.ndim == 2 else (*v.shape, size))
     cov = np.broadcast_to(cov, (*v.shape, size))
     has = _check_mask(mask_name, mask, v.shape)
@@ -77,6 +78,8 @@ def normalise(
     cov = np.where(both, cov, np.eye(size))
     root = _cholesky(cov_name, mask_name, cov)
     w = np.linalg.solve(root, v[..., None])[..., 0]
+    with np.errstate(over="ignore"):
+        _check_finite(f"the square of {name}", mask_name, w**2, has)
     return np.sum(w**2, axis=-1), has.sum(axis=-1), np.where(has, w, np.nan)
 
 

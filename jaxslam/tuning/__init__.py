@@ -1,8 +1,11 @@
 """Parameters of a model tuned by gradient, Q and R of the filter above all; see README.md here.
 
-The function `standard_errors` is in the module of the same name.
+`standard_errors` here is the module; `jaxslam.standard_errors` is its function.
 """
 
+from jaxslam.tuning.ekf_data import EkfSequence as EkfSequence
+from jaxslam.tuning.ekf_data import stack_sequences as stack_sequences
+from jaxslam.tuning.ekf_model import ekf_model as ekf_model
 from jaxslam.tuning.fitting import gradients as gradients
 from jaxslam.tuning.fitting import tune as tune
 from jaxslam.tuning.fitting import values as values

@@ -20,33 +20,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.se2 import wrap_angle
-from jaxslam.core.types import Array, check_array, check_type
+from jaxslam.core.types import Array
 from jaxslam.tuning.batch_last import Batched, recomputed
+from jaxslam.tuning.ekf_data import EkfSequence as EkfSequence
+from jaxslam.tuning.ekf_data import as_sequences
 from jaxslam.tuning.ekf_step import UNROLLED, Linearized, kalman_step
-from jaxslam.tuning.model import Model, as_arrays
-from jaxslam.tuning.model_checks import call, called, float_array
+from jaxslam.tuning.model import Model
+from jaxslam.tuning.model_checks import call, called, check_hashable, float_array
 
 SMALL = 3  # states and measurements up to which a batch of steps is batch first
 
 _MOTION, _MOTION_COV = "motion(params, state, input)", "motion_cov(params, state, input)"
 _MEASURE, _MEASUREMENT_COV = "measure(params, state)", "measurement_cov(params, state)"
-
-
-class EkfSequence(NamedTuple):
-    """Data of one sequence.
-
-    Attributes:
-        inputs: [T] what `motion` is given at each step, arrays that lead with T, or None.
-        measurements: (T, m) what `measure` predicts.
-        mask: (T, m) bool, False where a number was not measured, which may then be anything, NaN
-            too; None: all were.
-        truth: Anything that a loss compares with; the filter does not see it.
-    """
-
-    inputs: Any
-    measurements: Array
-    mask: Array | None = None
-    truth: Any = None
 
 
 class EkfState(NamedTuple):
@@ -88,6 +73,20 @@ class EkfInfo(NamedTuple):
     finite: Array
 
 
+class _Angles(NamedTuple):
+    """Which numbers of an argument are angles.
+
+    Attributes:
+        name: Of the argument.
+        indices: Of the angles.
+        size: How many numbers there are, where a bool is given for each.
+    """
+
+    name: str
+    indices: tuple[int, ...]
+    size: int | None = None
+
+
 class _Functions(NamedTuple):
     """The user's functions, and which numbers are angles; hashable."""
 
@@ -96,8 +95,8 @@ class _Functions(NamedTuple):
     measure: Callable
     motion_cov: Callable
     measurement_cov: Callable
-    state_angles: tuple[int, ...]
-    measurement_angles: tuple[int, ...]
+    state_angles: _Angles
+    measurement_angles: _Angles
     predict_first: bool
 
 
@@ -114,6 +113,8 @@ def ekf_model(
 ) -> Model:
     """An extended Kalman filter as a model that can be tuned; its data are `EkfSequence`s [B].
 
+    Or a list of single ones, which may differ in length.
+
     All functions are pure JAX of one state. The model is the same object for the same functions:
     define them once, at the level of a module. Derivatives of the model are taken in reverse only.
 
@@ -128,30 +129,34 @@ def ekf_model(
         predict_first: Whether the first step moves before it measures.
 
     Raises:
-        ValueError: A function is none, or an index is no whole number of at least 0.
+        ValueError: A function is none, or has no hash; an index is no whole number of at least 0;
+            or `predict_first` is no bool.
     """
     given: dict[str, Any] = {"init": init, "motion": motion, "measure": measure}
     given |= {"motion_cov": motion_cov, "measurement_cov": measurement_cov}
     for name, function in given.items():
         if not callable(function):
             raise ValueError(f"{name} is {type(function).__name__}, not a function")
+        check_hashable(name, function)
+    if predict_first not in (True, False):
+        raise ValueError(f"predict_first is {predict_first!r}, not True or False")
     return _build(
         _Functions(
             **given,
-            state_angles=_indices("state_angles", state_angles),
-            measurement_angles=_indices("measurement_angles", measurement_angles),
+            state_angles=_angles("state_angles", state_angles),
+            measurement_angles=_angles("measurement_angles", measurement_angles),
             predict_first=bool(predict_first),
         )
     )
 
 
-def _indices(name: str, given: Sequence[int] | Sequence[bool]) -> tuple[int, ...]:
-    array = np.asarray(given)
+def _angles(name: str, given: Sequence[int] | Sequence[bool]) -> _Angles:
+    array, size = np.asarray(given), None
     if array.dtype == bool:
-        array = np.flatnonzero(array)
+        array, size = np.flatnonzero(array), array.size
     if array.size and (array.ndim != 1 or array.dtype.kind not in "iu" or array.min() < 0):
         raise ValueError(f"{name} is {given!r}, not indices of numbers, or a bool for each")
-    return tuple(array.astype(int).tolist())
+    return _Angles(name, tuple(array.astype(int).tolist()), size)
 
 
 @lru_cache(maxsize=256)
@@ -268,33 +273,21 @@ def _stack(tree: Any) -> Array:
     return jnp.stack([_stack(part) for part in tree]) if isinstance(tree, tuple) else tree
 
 
-def _wrap(x: Array, angles: tuple[int, ...]) -> Array:
+def _wrap(x: Array, angles: _Angles) -> Array:
     """Angles among the numbers (n, ...) within pi."""
-    if not angles:
+    name, indices, size = angles
+    if size not in (None, len(x)):
+        raise ValueError(f"{name} has {size} bools, but there are {len(x)} numbers")
+    if not indices:
         return x
-    if max(angles) >= len(x):
-        raise ValueError(f"angle {max(angles)} is named of {len(x)} numbers, 0 to {len(x) - 1}")
-    chosen = np.isin(np.arange(len(x)), angles).reshape(-1, *(1,) * (x.ndim - 1))
+    if max(indices) >= len(x):
+        last = len(x) - 1
+        raise ValueError(f"{name} names {max(indices)} of {len(x)} numbers, which are 0 to {last}")
+    chosen = np.isin(np.arange(len(x)), indices).reshape(-1, *(1,) * (x.ndim - 1))
     return jnp.where(chosen, wrap_angle(x), x)
 
 
 def _check(functions: _Functions, params: Any, data: Any, name: str) -> tuple[Any, EkfSequence]:
     """Parameters and data [B] as arrays; ValueError if they do not fit the functions."""
-    check_type(name, data, EkfSequence)
-    params, data = as_arrays(params, data, name)
-    y, mask = np.asarray(data.measurements), data.mask
-    check_array(f"{name}.measurements", y, ("B", "T", "m"), np.floating)
-    if mask is not None:
-        check_array(f"{name}.mask", np.asarray(mask), y.shape, np.bool_)
-    bad = ~np.isfinite(y) & (True if mask is None else np.asarray(mask))
-    if bad.any():
-        at = np.argwhere(bad)[0].tolist()
-        value, advice = y[tuple(at)], "say in the mask what was not measured"
-        raise ValueError(f"{name}.measurements{at} is {value}; {advice}")
-    for path, leaf in jax.tree_util.tree_leaves_with_path(data.inputs):
-        own = f"{name}.inputs{jax.tree_util.keystr(path)}"
-        if np.shape(leaf)[:2] != y.shape[:2]:
-            raise ValueError(f"{own} is {leaf.dtype} {np.shape(leaf)}, not {y.shape[:2]} and more")
-        if leaf.dtype.kind == "f" and not np.isfinite(np.asarray(leaf)).all():
-            raise ValueError(f"{own} holds numbers that are not finite")
-    return params, data
+    del functions
+    return params, as_sequences(data, name)

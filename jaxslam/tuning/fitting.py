@@ -13,7 +13,7 @@ and are not tuned here.
 
 from collections.abc import Callable, Collection
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,83 +22,32 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxslam.core.devices import DeviceMap
-from jaxslam.core.episode import Episode
 from jaxslam.core.types import Array, as_count
 from jaxslam.pipeline.config import Config
-from jaxslam.tuning import parameters
-from jaxslam.tuning.inputs import check_alike
-from jaxslam.tuning.losses import Loss, check_loss, default_loss, model_for, resolve
+from jaxslam.tuning.losses import Loss, call_loss
 from jaxslam.tuning.model import Model, num_steps, run_model
-from jaxslam.tuning.model_checks import check_model
-from jaxslam.tuning.optimizers import default_optimizer
-from jaxslam.tuning.parameters import constrain, trainable_mask, unconstrain, unflatten_params
+from jaxslam.tuning.optimizers import check_optimizer, default_optimizer
+from jaxslam.tuning.parameters import constrain, theta_tree, trainable_mask, unconstrain
+from jaxslam.tuning.parameters import unflatten_params as unflatten_params
 from jaxslam.tuning.priors import FlatPrior, flatten_prior
-from jaxslam.tuning.slam_model import SlamCheck, as_model
-from jaxslam.tuning.transforms import Transform, of_leaves
+from jaxslam.tuning.problem import NOT_FINITE, StartError, check_start
+from jaxslam.tuning.problem import Problem as Problem
+from jaxslam.tuning.problem import as_model as as_model
+from jaxslam.tuning.problem import prepare as prepare
+from jaxslam.tuning.transforms import Transform
 from jaxslam.tuning.tune_state import TuneResult as TuneResult
 from jaxslam.tuning.tune_state import TuneState as TuneState
-from jaxslam.tuning.tune_state import check_state, record, stalled
+from jaxslam.tuning.tune_state import check_loss_of_state, check_state, record, stalled
 from jaxslam.tuning.tune_state import init as init
 from jaxslam.tuning.tune_state import result as result
 
 Transforms = tuple[Transform, ...]
 
 
-class Problem(NamedTuple):
-    """What is tuned, checked.
-
-    Attributes:
-        model: The model.
-        loss: The loss.
-        transforms: Of each leaf of the parameters.
-        params: The parameters as arrays.
-        data: [B] sequences as arrays.
-    """
-
-    model: Model
-    loss: Loss
-    transforms: Transforms
-    params: Any
-    data: Any
-
-
-def prepare(
-    model: Model | Config,
-    params: Any,
-    data: Any,
-    loss: Loss | str | None = None,
-    *,
-    transforms: Any = None,
-    name: str | None = None,
-) -> Problem:
-    """The arguments of `tune`, checked and converted; ValueError unless all fits together.
-
-    Args:
-        model: The model.
-        params: Its parameters.
-        data: [B] sequences.
-        loss: The loss; None for the default one.
-        transforms: Of the parameters.
-        name: What the data are called in messages; by default episodes, where they are such.
-    """
-    model = as_model(model)
-    if name is None:
-        is_slam = isinstance(model.check, SlamCheck) or isinstance(data, Episode)
-        name = "episodes" if is_slam else "data"
-    params, stacked = model.check(params, data, name)
-    used = of_leaves(params, transforms)
-    arrays = parameters.as_params(params, transforms)
-    if not isinstance(stacked, Episode):  # the filter's functions fit, and take long to trace
-        check_model(model, arrays, jax.tree.map(lambda x: x[0], stacked))
-    function = default_loss(stacked) if loss is None else resolve(loss)
-    check_loss(function, stacked, name=name)
-    return Problem(model_for(function, model), function, used, arrays, stacked)
-
-
 def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any) -> Array:
     """Loss () of one sequence."""
     _, info = run_model(model, constrain(theta, transforms), sequence)
-    return loss(info, sequence)
+    return call_loss(loss, info, sequence)
 
 
 def _value_and_gradient(
@@ -118,9 +67,11 @@ def _over_devices(function: Callable[..., Any], batch_size: int) -> DeviceMap:
 
 def _evaluate(function: Callable[..., Any], problem: Problem) -> Any:
     """`_value` or `_value_and_gradient` of all sequences of a problem."""
-    model, loss, transforms, params, data = problem
+    model, loss, transforms, params, data, theta = problem
     run = _over_devices(function, model.batch_size)
-    return run(model, loss, transforms, unconstrain(params, transforms), data)
+    if theta is None:
+        return run(model, loss, transforms, unconstrain(params, transforms), data)
+    return run(model, loss, transforms, theta_tree(theta, params, transforms), data)
 
 
 def values(
@@ -255,19 +206,23 @@ def tune(
     Raises:
         ValueError: Before anything is compiled: an argument has another type; a parameter is
             outside the domain of its transform; the data do not fit the model; a step of the model
-            returns another state than it is given; there are no data; the loss needs ground truth
-            and an episode has none; held-out episodes have other fields; a parameter's name is
-            unknown; a number is out of range; the state is of another call.
+            returns another state than it is given; there are no data; the loss is no number, or
+            needs ground truth and an episode has none; held-out sequences have other fields; a
+            parameter's name is unknown; a number is out of range; the state is of another call.
+            After the first evaluation: the loss of no sequence is finite, or it depends on no
+            parameter that is tuned, or it is another than that of the state.
     """
     problem = prepare(model, params, data, loss, transforms=transforms)
-    model, used_loss, used, params, training = problem
+    model, used_loss, _, params, training, _ = problem
     validation = None
     if heldout is not None:
-        if not isinstance(training, Episode):
-            check_alike(training, heldout)
-        checked = prepare(model, params, heldout, used_loss, transforms=transforms, name="heldout")
-        validation = checked.data
-        check_alike(training, validation)
+        validation = prepare(
+            model, params, heldout, used_loss, transforms=transforms, name="heldout", like=training
+        ).data
+    elif patience is not None:
+        raise ValueError(f"patience is {patience}, but there is no heldout to validate on")
+    if callback is not None and not callable(callback):
+        raise ValueError(f"callback is {callback!r}, not a function of the state")
     num_updates = as_count("num_updates", num_updates, least=0)
     seed = as_count("seed", seed, least=0)
     as_count("evaluate_every", evaluate_every)
@@ -280,27 +235,40 @@ def tune(
     weight = 1.0 / (count * num_steps(model, params, training))
     if optimizer is None:
         optimizer = default_optimizer(num_updates, whole=whole)
-    optimizer = optax.with_extra_args_support(optimizer)
+    optimizer = check_optimizer(optimizer, int(trainable.sum()))
+    start = init(
+        params, num_updates=num_updates, frozen=frozen, optimizer=optimizer, transforms=transforms
+    )
+
+    def evaluate(theta: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """Losses and gradients of the sequences of a step."""
+        batch = training if whole else _take(draw_batch(seed, step, count, size), training)
+        current = unflatten_params(theta, params, transforms)
+        return gradients_of(problem._replace(params=current, data=batch, theta=theta))
+
     if state is None:
-        state = init(
-            params,
-            num_updates=num_updates,
-            frozen=frozen,
-            optimizer=optimizer,
-            transforms=transforms,
-        )
-    check_state(state, trainable.size, num_updates)
+        state = start
+    else:
+        check_state(state, start)
+        first = state.theta_history[0]
+        each = evaluate(first, 0)
+        own = _with_prior(*mean_gradient(*each)[:2], penalty, weight, first)[0]
+        check_loss_of_state(state, own, _finite_mean(np.abs(each[0])))
 
     while state.step <= num_updates and not stalled(state, patience):
-        current = unflatten_params(state.theta, params, transforms)
         step = int(state.step)
-        batch = training if whole else _take(draw_batch(seed, step, count, size), training)
-        now = problem._replace(params=current, data=batch)
-        value, gradient, skipped = mean_gradient(*gradients_of(now))
+        each = evaluate(state.theta, step)
+        if whole and step == 0:
+            check_start(*each, trainable, alone=num_updates > 0 and not penalty.precision.any())
+        value, gradient, skipped = mean_gradient(*each)
         value, gradient = _with_prior(value, gradient, penalty, weight, state.theta)
         heldout_loss = np.nan
         if validation is not None and (step % evaluate_every == 0 or step == num_updates):
-            heldout_loss = _finite_mean(values_of(now._replace(data=validation)))
+            current = unflatten_params(state.theta, params, transforms)
+            now = problem._replace(params=current, data=validation, theta=state.theta)
+            heldout_loss = _finite_mean(values_of(now))
+            if step == 0 and not np.isfinite(heldout_loss):
+                raise StartError(f"heldout: the loss of no sequence is finite; {NOT_FINITE}")
         state = record(state, value, heldout_loss, skipped)
         state = _update_theta(state, optimizer, value, gradient, trainable)
         if callback is not None:

@@ -144,9 +144,19 @@ def check_alike(data: Any, heldout: Any) -> None:
     differ.
     """
     if not (isinstance(data, Episode) and isinstance(heldout, Episode)):
-        wanted, found = str(jax.tree.structure(data)), str(jax.tree.structure(heldout))
-        if found != wanted:
-            raise ValueError(f"heldout is {found}, not {wanted} as the data to tune on")
+        if str(jax.tree.structure(data)) != str(jax.tree.structure(heldout)):
+            wanted, found = (", ".join(sorted(_fields(each)))[:200] for each in (data, heldout))
+            raise ValueError(
+                f"heldout is {found or 'one array'}, not {wanted or 'one array'} as the data to "
+                "tune on"
+            )
+        for name, x in _fields(data).items():
+            own = _fields(heldout)[name]
+            if np.ndim(own) != np.ndim(x) or own.dtype.kind != x.dtype.kind:
+                raise ValueError(
+                    f"heldout{name} is {own.dtype} {np.shape(own)}, of the data to tune on "
+                    f"{x.dtype} {np.shape(x)}"
+                )
         return
     for field in ("landmark_ids", "scan_matches"):
         ours, other = (getattr(part, field) is None for part in (data, heldout))
@@ -159,3 +169,9 @@ def check_alike(data: Any, heldout: Any) -> None:
             f"heldout has M = {other_m} features a step, episodes has {m}; pad them alike, as "
             "stack_episodes does"
         )
+
+
+def _fields(data: Any) -> dict[str, Any]:
+    """The arrays of a tree by their paths; a tree that is one array has the path of nothing."""
+    leaves = jax.tree_util.tree_leaves_with_path(data)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

@@ -19,9 +19,11 @@ from jaxslam.core.types import Array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, pose_error
 from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.tuning.model import Model
+from jaxslam.tuning.model_checks import called, check_hashable
 from jaxslam.tuning.prediction import (
     Comparison,
     Memories,
+    NisConsistency,
     closure_nll,
     prediction_nll,
     run_twice,
@@ -134,10 +136,49 @@ def name_of(loss: Loss) -> str:
     raise ValueError(f"{loss!r} is none of {', '.join(BY_NAME)}")
 
 
+def call_loss(loss: Loss, info: Any, sequence: Any) -> Array:
+    """The loss () of a sequence; while tracing.
+
+    Raises:
+        ValueError: The loss fails, with the first line of its message, or is no float ().
+    """
+    name = f"loss {text_of(loss)}"
+    try:
+        value = called(f"{name} of infos and a sequence", loss, info, sequence)
+    except ValueError as error:
+        cause = error.__cause__
+        if isinstance(cause, AttributeError) and cause.name and is_of_this_package(loss):
+            raise ValueError(
+                f"{name} needs {cause.name} in what the steps of the model return, which lacks it; "
+                "give a loss of your own, a function of these and the sequence"
+            ) from error
+        raise
+    shape, kind = np.shape(value), getattr(value, "dtype", np.result_type(type(value)))
+    if shape or not jnp.issubdtype(kind, jnp.floating):
+        raise ValueError(f"{name} returns {kind} {shape} of a sequence, not one float ()")
+    return value
+
+
+def is_of_this_package(loss: Loss) -> bool:
+    """Whether a loss, or all terms of a sum, are those of this package."""
+    if isinstance(loss, WeightedLoss):
+        return all(is_of_this_package(term) for _, term in loss.terms)
+    return loss in BY_NAME.values() or isinstance(loss, Comparison | NisConsistency)
+
+
+def text_of(loss: Any) -> str:
+    """Name of a loss, for messages."""
+    return getattr(loss, "__name__", None) or repr(loss)
+
+
 def comparisons(loss: Loss) -> list[Comparison]:
     """The losses among the terms that compare a model with itself with less memory."""
-    terms = [term for _, term in loss.terms] if isinstance(loss, WeightedLoss) else [loss]
-    return [term for term in terms if isinstance(term, Comparison)]
+    return [term for term in terms_of(loss) if isinstance(term, Comparison)]
+
+
+def terms_of(loss: Loss) -> list[Loss]:
+    """The losses of a sum, or a loss alone."""
+    return [term for _, term in loss.terms] if isinstance(loss, WeightedLoss) else [loss]
 
 
 def model_for(loss: Loss, model: Model) -> Model:
@@ -173,18 +214,33 @@ def check_loss(loss: Loss, data: Any, *, name: str = "episodes") -> None:
     if not callable(loss):
         named = f"losses.BY_NAME has {', '.join(BY_NAME)}"
         raise ValueError(f"loss is {loss!r}, not a function of step infos and an episode; {named}")
-    if isinstance(loss, WeightedLoss) and not loss.terms:
-        raise ValueError("loss is a WeightedLoss without terms")
+    if isinstance(loss, WeightedLoss):
+        _check_terms(loss.terms)
+    check_hashable("loss", loss)
     compared = comparisons(loss)
     if len(compared) > 1:
         raise ValueError("loss is a WeightedLoss of two losses that run the model twice; take one")
     if not isinstance(data, Episode):
         if needs_truth(loss):
-            raise ValueError(f"loss {loss!r} is of episodes, which {name} are not")
+            raise ValueError(f"loss {text_of(loss)} is of episodes, which {name} are not")
     else:
         _check_episodes(loss, data, name)
-    for term in compared:
-        term.check(data, name)
+    for term in terms_of(loss):
+        if isinstance(term, Comparison | NisConsistency):
+            term.check(data, name)
+
+
+def _check_terms(terms: Any) -> None:
+    """Raise ValueError unless the terms of a `WeightedLoss` are weights and losses."""
+    if isinstance(terms, tuple | list) and not terms:
+        raise ValueError("loss is a WeightedLoss without terms")
+    if not isinstance(terms, tuple) or not all(type(x) is tuple and len(x) == 2 for x in terms):
+        raise ValueError(f"WeightedLoss.terms is {terms!r}, not a tuple of (weight, loss)")
+    for weight, loss in terms:
+        if not isinstance(weight, float | int | np.number) or not np.isfinite(weight):
+            raise ValueError(f"WeightedLoss.terms holds the weight {weight!r}, not a finite number")
+        if not callable(loss) or isinstance(loss, WeightedLoss):
+            raise ValueError(f"WeightedLoss.terms holds {loss!r}, not a loss")
 
 
 def _check_episodes(loss: Loss, data: Episode, name: str) -> None:

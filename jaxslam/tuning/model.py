@@ -41,9 +41,8 @@ def as_arrays(params: Any, data: Any, name: str) -> tuple[Any, Any]:
         if array.ndim < 1 or array.dtype.kind not in "fiub":
             wanted = "an array of numbers that leads with the number of sequences"
             raise ValueError(f"{own} is {array.dtype} {array.shape}, not {wanted}")
-        return array.astype(float_dtype) if array.dtype.kind == "f" else array
+        return _in_default_precision(own, array)
 
-    float_dtype = np.dtype(jnp.zeros(()).dtype)
     arrays = jax.tree_util.tree_map_with_path(convert, data)
     sizes = {f"{name}{jax.tree_util.keystr(path)}": np.shape(leaf)[0] for path, leaf in leaves}
     if len(set(sizes.values())) > 1:
@@ -52,6 +51,26 @@ def as_arrays(params: Any, data: Any, name: str) -> tuple[Any, Any]:
     if not min(sizes.values()):
         raise ValueError(f"{name}: no sequences")
     return params, arrays
+
+
+def _in_default_precision(name: str, array: Any) -> Any:
+    """An array in JAX's default precision; ValueError where its numbers are too large for it."""
+    wanted = array.dtype
+    if array.dtype.kind == "f":
+        wanted = np.dtype(jnp.zeros(()).dtype)
+    elif array.dtype.kind in "iu":
+        wanted = np.dtype(jax.dtypes.canonicalize_dtype(array.dtype))
+    if array.dtype == wanted:
+        return array
+    with np.errstate(over="ignore"):
+        converted = array.astype(wanted)
+    lost = np.isinf(converted) & ~np.isinf(array) if wanted.kind == "f" else converted != array
+    if np.any(lost):
+        at = np.argwhere(np.asarray(lost))[0].tolist()
+        raise ValueError(
+            f"{name}{at} is {array[tuple(at)]}, too large for {wanted}; use other units, or 64 bits"
+        )
+    return converted
 
 
 class Model(NamedTuple):

@@ -10,6 +10,17 @@ from jaxslam.core.types import Array
 from jaxslam.tuning.model import Model
 
 
+def check_hashable(name: str, x: Any) -> None:
+    """Raise ValueError unless something can be static under jit."""
+    try:
+        hash(x)
+    except TypeError as error:
+        raise ValueError(
+            f"{name} is {x!r}, which has no hash ({error}): give a function, or a frozen "
+            "record of functions and numbers"
+        ) from None
+
+
 def check_model(model: Model, params: Any, sequence: Any) -> None:
     """Raise ValueError unless the functions of a model fit together on a sequence.
 
@@ -26,7 +37,14 @@ def check_model(model: Model, params: Any, sequence: Any) -> None:
     state = _shapes("model.init(params, sequence)", model.init, params, sequence)
     inputs = _shapes("model.inputs(params, sequence)", model.inputs, params, sequence)
     lengths = {_name(path): leaf.shape[:1] for path, leaf in _leaves(inputs)}
-    if not lengths or () in lengths.values() or (0,) in lengths.values():
+    for path, size in lengths.items():
+        if not size or not size[0]:
+            found = "has no steps" if size else "is a number"
+            raise ValueError(
+                f"model.inputs(params, sequence){path} {found}, not an array that leads with the "
+                "steps: data are arrays (B, T, ...), or Model.inputs makes those of the steps"
+            )
+    if not lengths:
         raise ValueError("model.inputs(params, sequence) has no arrays that lead with the steps")
     if len(set(lengths.values())) > 1:
         text = ", ".join(f"{name or 'it'} {size[0]}" for name, size in lengths.items())

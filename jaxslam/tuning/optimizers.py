@@ -62,6 +62,33 @@ def default_optimizer(num_updates: int, *, whole: bool) -> optax.GradientTransfo
     return lbfgs_backtracking() if whole else _adam(num_updates)
 
 
+def check_optimizer(optimizer: Any, num_params: int) -> optax.GradientTransformationExtraArgs:
+    """An optimiser that takes the value of the loss; ValueError unless it is one of F parameters.
+
+    By the shapes that it returns: nothing is compiled.
+    """
+    if not all(callable(getattr(optimizer, name, None)) for name in ("init", "update")):
+        raise ValueError(f"optimizer is {optimizer!r}, not one of optax, as optax.adam(0.1)")
+    optimizer = optax.with_extra_args_support(optimizer)
+    theta = jax.ShapeDtypeStruct((num_params,), jnp.zeros(()).dtype)
+
+    def first(theta: Array, value: Array) -> Array:
+        return optimizer.update(theta, optimizer.init(theta), theta, value=value)[0]
+
+    try:
+        with jax.numpy_dtype_promotion("standard"):  # optax needs it
+            change = jax.eval_shape(first, theta, jax.ShapeDtypeStruct((), theta.dtype))
+    except Exception as error:
+        line = (str(error).strip().splitlines() or [""])[0]
+        raise ValueError(
+            f"optimizer fails: {type(error).__name__}: {line}; it is given gradient, state, "
+            "parameters and the value of the loss, which it does not evaluate"
+        ) from error
+    if getattr(change, "shape", None) != theta.shape:
+        raise ValueError(f"optimizer.update returns {change}, not a change of {num_params} numbers")
+    return optimizer
+
+
 @cache
 def _adam(num_updates: int) -> optax.GradientTransformationExtraArgs:
     """Adam, whose learning rate decays over `num_updates`."""

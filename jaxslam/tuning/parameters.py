@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.types import Array
 from jaxslam.tuning.transforms import CHOLESKY, Transform, of_leaves
 
 
@@ -57,15 +58,35 @@ def as_params(params: Any, transforms: Any = None, *, name: str = "params") -> A
     for (path, leaf), transform in zip(paths, of_leaves(params, transforms), strict=True):
         own = ".".join(filter(None, [name, _path_text(path)]))
         try:
-            numbers = np.asarray(leaf, np.float64)
+            numbers = np.asarray(leaf)
         except (TypeError, ValueError):
-            raise ValueError(f"{own} is a {type(leaf).__name__}, not a number") from None
-        finite = np.isfinite(numbers).all()
-        if not finite or not transform.domain(numbers, *transform.constants):
-            wanted = f"{transform.text} and finite" if transform.text != "a number" else "finite"
-            raise ValueError(f"{own} is {numbers.tolist()}, not {wanted}")
-        arrays.append(jnp.asarray(leaf, float))
+            numbers = np.asarray(None)
+        if numbers.dtype.kind not in "fiu" and not jnp.issubdtype(numbers.dtype, jnp.floating):
+            what = f"an array of {leaf.dtype}" if np.ndim(leaf) else f"a {type(leaf).__name__}"
+            raise ValueError(f"{own} is {what}, not a number")
+        if transform is CHOLESKY and numbers.ndim != 2:
+            raise ValueError(f"{own} is of the shape {numbers.shape}, not a matrix in one array")
+        arrays.append(_as_param(own, numbers, transform))
     return jax.tree.unflatten(jax.tree.structure(params), arrays)
+
+
+def _as_param(name: str, value: np.ndarray, transform: Transform) -> Array:
+    """A leaf in JAX's default float type; ValueError unless it is in the domain of its transform.
+
+    Rounded to single precision it may be on the edge of it, from where no step leads on.
+    """
+    with np.errstate(all="ignore"):
+        numbers = np.asarray(value, np.float64)
+        array = jnp.asarray(numbers, float)
+        for each, note in (numbers, ""), (np.asarray(array), f" in {array.dtype}"):
+            fits = np.isfinite(each).all() and transform.domain(each, *transform.constants)
+            each = each.astype(np.float64)
+            theta = transform.inverse(each, *transform.constants) if fits else np.nan
+            if not np.isfinite(theta).all():
+                text = transform.text
+                wanted = f"{text} and finite" if text != "a number" else "finite"
+                raise ValueError(f"{name} is {numbers.tolist()}, not {wanted}{note}")
+    return array
 
 
 def flatten_params(params: Any, transforms: Any = None) -> np.ndarray:
@@ -80,16 +101,34 @@ def unflatten_params(theta: Any, like: Any, transforms: Any = None) -> Any:
     return jax.tree.unflatten(jax.tree.structure(like), arrays)
 
 
-def _host_params(theta: Any, like: Any, transforms: Sequence[Transform]) -> list[np.ndarray]:
-    """The leaves of parameters of unconstrained numbers (P,), float64."""
-    shapes = [np.shape(x) for x in _host_theta(like, transforms)]
+def theta_tree(theta: Any, like: Any, transforms: Sequence[Transform]) -> Any:
+    """Unconstrained numbers (P,) in the tree of parameters, in JAX's default float type."""
+    leaves = [jnp.asarray(x, float) for x in _theta_leaves(theta, like, transforms)]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _theta_leaves(theta: Any, like: Any, transforms: Sequence[Transform]) -> list[np.ndarray]:
+    """Unconstrained numbers (P,) in the shapes of those of each leaf, float64."""
+    leaves = zip(jax.tree.leaves(like), transforms, strict=True)
+    shapes = [theta_shape(leaf, transform) for leaf, transform in leaves]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
     parts = np.split(np.asarray(theta, np.float64), ends[:-1])
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def theta_shape(leaf: Any, transform: Transform) -> tuple[int, ...]:
+    """Shape of the unconstrained numbers of a leaf of the parameters."""
+    shape = np.shape(leaf)
+    if transform.forward is CHOLESKY.forward:
+        return (shape[0] * (shape[0] + 1) // 2,)
+    return shape
+
+
+def _host_params(theta: Any, like: Any, transforms: Sequence[Transform]) -> list[np.ndarray]:
+    """The leaves of parameters of unconstrained numbers (P,), float64."""
+    pairs = zip(_theta_leaves(theta, like, transforms), transforms, strict=True)
     with np.errstate(all="ignore"):  # an optimiser may propose what overflows
-        return [
-            one.forward(part.reshape(shape), *one.constants)
-            for part, shape, one in zip(parts, shapes, transforms, strict=True)
-        ]
+        return [one.forward(part, *one.constants) for part, one in pairs]
 
 
 def _path_text(path: Sequence[Any]) -> str:
@@ -105,10 +144,15 @@ def _path_text(path: Sequence[Any]) -> str:
     return text.removeprefix(".")
 
 
+def leaf_names(params: Any) -> list[str]:
+    """Name of each leaf of the parameters."""
+    return [_path_text(path) for path, _ in jax.tree_util.tree_leaves_with_path(params)]
+
+
 def param_names(params: Any, transforms: Any = None) -> tuple[str, ...]:
     """Names of the P unconstrained numbers: `range_std`, `odometry_coefficients[2]`, `w.b[0,1]`.
 
-    Those of a matrix by its Cholesky factor are the elements of the factor.
+    Those of a matrix are the elements of a lower triangle, as `transforms` describes them.
     """
     names = []
     paths = jax.tree_util.tree_leaves_with_path(params)
@@ -137,6 +181,8 @@ def trainable_mask(params: Any, frozen: Collection[str] = (), transforms: Any = 
     """
     if isinstance(frozen, str):
         raise ValueError(f"frozen is the string {frozen!r}, not a collection of names")
+    if not isinstance(frozen, Collection):
+        raise ValueError(f"frozen is {frozen!r}, not a collection of names")
     known = param_names(params, transforms)
 
     def is_part(name: str, whole: Any) -> bool:
@@ -153,9 +199,9 @@ def trainable_mask(params: Any, frozen: Collection[str] = (), transforms: Any = 
 
 
 def _field_paths(params: Any) -> set[str]:
-    """Paths of the fields that are None: names that may be frozen, though there is no number."""
+    """Paths of the fields that are None or empty: they may be frozen, without a number."""
     paths = jax.tree_util.tree_leaves_with_path(params, is_leaf=lambda x: x is None)
-    return {_path_text(path) for path, leaf in paths if leaf is None}
+    return {_path_text(path) for path, leaf in paths if leaf is None or not np.size(leaf)}
 
 
 def shift_param(params: Any, index: int, by: float, transforms: Any = None) -> Any:

@@ -45,8 +45,9 @@ import numpy as np
 from jax.scipy.special import digamma
 
 from jaxslam.core.episode import Episode
-from jaxslam.core.types import Array
+from jaxslam.core.types import Array, as_count
 from jaxslam.filtering.belief import Belief, prune
+from jaxslam.tuning.ekf_data import EkfSequence
 from jaxslam.tuning.model import Model
 
 NORMAL_QUANTILE = 3.0902  # 99.9 %
@@ -95,6 +96,11 @@ class PredictionNll:
     def check(self, data: Any, name: str) -> None:
         """Raise ValueError where there is nothing to predict."""
         _check_steps(self, data, name)
+        if isinstance(data, EkfSequence):
+            raise ValueError(
+                "prediction is of maps, which grow with what is seen: the states of ekf_model do "
+                "not; use losses.innovation_nll"
+            )
         if isinstance(data, Episode) and data.landmark_ids is not None:
             for number, ids in enumerate(np.asarray(data.landmark_ids)):
                 parts = [np.unique(ids[i : i + self.steps]) for i in range(0, len(ids), self.steps)]
@@ -169,6 +175,11 @@ class NisConsistency:
     """
 
     steps: int = 64
+
+    def check(self, data: Any, name: str) -> None:
+        """Raise ValueError where the windows are impossible."""
+        del data, name
+        as_count("NisConsistency.steps", self.steps)
 
     def __call__(self, info: Any, sequence: Any) -> Array:
         """The loss ()."""
@@ -278,9 +289,8 @@ def _sums(x: Array, steps: int) -> Array:
 
 def _check_steps(loss: Comparison, data: Any, name: str) -> None:
     """Raise ValueError unless the steps of a loss are possible, and episodes longer."""
-    kind, steps = type(loss).__name__, loss.steps
-    if not isinstance(steps, int) or steps < 1:
-        raise ValueError(f"{kind}.steps is {steps!r}, not a whole number of at least 1")
+    kind = type(loss).__name__
+    steps = as_count(f"{kind}.steps", loss.steps)
     if isinstance(data, Episode) and data.odometry.shape[1] <= steps:
         raise ValueError(
             f"{name} have {data.odometry.shape[1]} steps, of which {kind} needs more than {steps}; "

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxslam.tuning.transforms import Transform, of_leaves
+from jaxslam.tuning.parameters import leaf_names
+from jaxslam.tuning.transforms import Transform, of_leaves, spread_leaves
 
 
 class Prior(NamedTuple):
@@ -56,35 +57,43 @@ def flatten_prior(prior: Any, params: Any, transforms: Any = None) -> FlatPrior:
     """
     leaves = jax.tree.leaves(params)
     used = of_leaves(params, transforms)
-    try:
-        spread = jax.tree.map(_spread, prior, params, is_leaf=_is_prior)
-    except (ValueError, TypeError, KeyError) as error:
-        first = str(error).splitlines()[0]
-        raise ValueError(f"prior is no tree like the parameters: {first}") from None
-    given = jax.tree.leaves(spread, is_leaf=lambda x: isinstance(x, Prior))
+    given = spread_leaves("prior", prior, params, _is_prior, _spread)
     if not all(isinstance(one, Prior) for one in given):
         raise ValueError("prior is no tree of Priors like the parameters, None where there is none")
     means, precisions = [], []
-    for number, (one, leaf, transform) in enumerate(zip(given, leaves, used, strict=True)):
+    for name, one, leaf, transform in zip(leaf_names(params), given, leaves, used, strict=True):
         start = transform.inverse(np.asarray(leaf, np.float64), *transform.constants)
         if one is NO_PRIOR:
             means.append(np.zeros(np.shape(start)))
             precisions.append(np.zeros(np.shape(start)))
             continue
         if np.shape(start) != np.shape(leaf):
-            raise ValueError(f"prior of leaf {number} is of a matrix, which has none")
-        mean = np.broadcast_to(np.asarray(one.mean, np.float64), np.shape(leaf))
-        std = np.broadcast_to(np.asarray(one.std, np.float64), np.shape(leaf))
+            raise ValueError(f"prior of {name} is of a matrix, which has none")
+        mean, std = (_broadcast(name, one, x, np.shape(leaf)) for x in one)
         finite = np.isfinite(mean).all() and np.isfinite(std).all() and (std > 0.0).all()
-        if not finite or not transform.domain(mean, *transform.constants):
+        theta = precision = mean
+        if finite and transform.domain(mean, *transform.constants):
+            theta = transform.inverse(mean, *transform.constants)
+            with np.errstate(over="ignore"):
+                precision = (_slope(transform, theta) / std) ** 2
+        else:
+            finite = False
+        if not finite or not np.isfinite(precision).all():
             wanted = f"a mean that is {transform.text}, and a positive standard deviation"
-            raise ValueError(f"prior of leaf {number} is {one}, not {wanted}")
-        theta = transform.inverse(mean, *transform.constants)
-        slope = _slope(transform, theta)
+            raise ValueError(f"prior of {name} is {one}, not {wanted}, both finite")
         means.append(theta)
-        precisions.append((slope / std) ** 2)
+        precisions.append(precision)
     flat = [np.concatenate([np.ravel(x) for x in some]) for some in (means, precisions)]
     return FlatPrior(*flat)
+
+
+def _broadcast(name: str, prior: Prior, x: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A mean or standard deviation as floats of the shape of its parameter."""
+    try:
+        return np.broadcast_to(np.asarray(x, np.float64), shape)
+    except (TypeError, ValueError):
+        wanted = f"numbers, one for all or of the shape {shape}"
+        raise ValueError(f"prior of {name} is {prior}, not {wanted}") from None
 
 
 def _slope(transform: Transform, theta: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.types import as_count
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.config import FilterConfig, check_options
@@ -17,6 +18,7 @@ from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import EPISODE_BATCH
 from jaxslam.tuning.inputs import as_episodes, as_params, check_scan_matching
 from jaxslam.tuning.model import Model
+from jaxslam.tuning.model_checks import check_hashable
 
 
 class SlamInit(NamedTuple):
@@ -113,9 +115,11 @@ def as_model(model: Model | Config) -> Model:
     if isinstance(model, Config):
         return slam_model(model)
     if not isinstance(model, Model):
-        order = "the order is config, params, episodes"  # two that were swapped are the usual cause
-        raise ValueError(f"config is {type(model).__name__}, not Config or a tuning.Model; {order}")
+        order = "the order is model, params, data"  # two that were swapped are the usual cause
+        raise ValueError(f"model is {type(model).__name__}, not Config or a tuning.Model; {order}")
     for name, function in model._asdict().items():
         if name != "batch_size" and not callable(function):
             raise ValueError(f"model.{name} is {function!r}, not a function")
+    as_count("model.batch_size", model.batch_size)
+    check_hashable("model", model)
     return model

@@ -28,18 +28,22 @@ which is P^-1 where the data say nothing, and as above where they say all. Which
 determine is answered without it.
 """
 
+import math
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jaxslam.core.episode import Episode
 from jaxslam.pipeline.config import Config
 from jaxslam.tuning import fitting, parameters
 from jaxslam.tuning.fitting import Problem
 from jaxslam.tuning.losses import Loss
 from jaxslam.tuning.model import Model, num_steps
+from jaxslam.tuning.parameters import theta_shape
 from jaxslam.tuning.priors import flatten_prior
+from jaxslam.tuning.transforms import REAL, of_leaves
 
 DIFFERENCE_STEP = 0.1  # step of a logarithm for central differences of the gradient
 # Relative standard error from which a parameter counts as not identifiable.
@@ -57,7 +61,8 @@ class StandardErrors(NamedTuple):
             ten percent; NaN where frozen, inf where not determined.
         covariance: (P, P) of theta in the determined directions; zero where frozen.
         identifiable: (P,) bool; False where frozen.
-        warnings: Messages about free parameters that are not identifiable; empty if all are.
+        warnings: Messages about free parameters that are not identifiable, and where the loss has
+            no minimum; empty if all is well.
         of_params: Standard errors of the parameters themselves, in their units and their tree.
     """
 
@@ -104,18 +109,46 @@ def standard_errors(
     params = problem.params
     trainable = parameters.trainable_mask(params, frozen, transforms)
     count = len(jax.tree.leaves(problem.data)[0])
+    kind = "episodes" if isinstance(problem.data, Episode) else "sequences"
     if count < 2:
-        raise ValueError("standard errors need two episodes or more; episodes has 1")
+        raise ValueError(f"standard errors need two {kind} or more; {kind} has 1")
     theta = parameters.flatten_params(params, transforms)
     steps = num_steps(problem.model, params, problem.data)
-    precision = flatten_prior(prior, params, transforms).precision[trainable]
+    penalty = flatten_prior(prior, params, transforms)
+    precision = penalty.precision[trainable]
     hessian, gradients = second_derivatives(problem, theta, trainable, transforms)
     used = len(gradients)
     outer = gradients.T @ gradients / max(used, 1)
     if used < 2:
         hessian, outer = np.zeros_like(hessian), np.zeros_like(outer)
     own, unknown = _covariance(hessian, outer, used, precision / (count * steps), count * steps)
-    return _errors(params, transforms, theta, trainable, own, unknown, used)
+    pull = penalty.value_and_gradient(theta)[1][trainable] / (count * steps)
+    found = _errors(params, transforms, theta, trainable, own, unknown, f"{used} {kind}")
+    slopes = _slope_text(np.array(found.names)[trainable], gradients, pull)
+    return found._replace(warnings=found.warnings + slopes)
+
+
+def _slope_text(names: np.ndarray, gradients: np.ndarray, pull: np.ndarray) -> tuple[str, ...]:
+    """A message about where the loss is not at its minimum, which all of this is about.
+
+    The mean gradient is compared with its standard error sqrt(J / B), in any units.
+
+    Args:
+        names: (F,) of the free parameters.
+        gradients: (G, F) of the sequences.
+        pull: (F,) gradient of the prior.
+    """
+    if len(gradients) < 2:
+        return ()
+    slope = np.abs(gradients.mean(axis=0) + pull)
+    steep = slope > np.sqrt(np.mean(gradients**2, axis=0) / len(gradients))
+    if not steep.any():
+        return ()
+    found = ", ".join(names[steep])
+    return (
+        f"no minimum of the loss: it still falls along {found} by more than its own standard "
+        "error; tune for more updates before these standard errors are used",
+    )
 
 
 def second_derivatives(
@@ -140,7 +173,7 @@ def second_derivatives(
     def gradient_beside(index: int, offset: float) -> np.ndarray:
         beside = theta + offset * (np.arange(len(theta)) == index)
         params = parameters.unflatten_params(beside, problem.params, transforms)
-        each = fitting.gradients_of(problem._replace(params=params))
+        each = fitting.gradients_of(problem._replace(params=params, theta=beside))
         return fitting.mean_gradient(*each)[1][indices]
 
     rows = [
@@ -202,7 +235,7 @@ def _errors(
     trainable: np.ndarray,
     own: np.ndarray,
     unknown: np.ndarray,
-    count: int,
+    data: str,
 ) -> StandardErrors:
     """Standard errors of P parameters, from the covariance (F, F) of those that are trainable."""
     names = parameters.param_names(params, transforms)
@@ -218,9 +251,13 @@ def _errors(
     unidentifiable = [names[i] for i in np.flatnonzero(trainable & ~identifiable)]
     warnings = []
     if unidentifiable:
-        advice = "freeze some, or take more episodes or another loss"
+        advice = f"freeze some, or take more {data.split()[1]} or another loss"
         found = ", ".join(unidentifiable)
-        warnings = [f"not identifiable from these {count} episodes: {found}; {advice}"]
+        used = zip(jax.tree.leaves(params), of_leaves(params, transforms), strict=True)
+        unscaled = [np.full(math.prod(theta_shape(x, one)), one == REAL) for x, one in used]
+        if np.any(np.concatenate(unscaled) & trainable & ~identifiable):
+            advice += ", or say by transforms.real(scale) which change of one is large"
+        warnings = [f"not identifiable from these {data}: {found}; {advice}"]
     return StandardErrors(names, relative, covariance, identifiable, tuple(warnings), of_params)
 
 

@@ -12,7 +12,11 @@ a factor of e of what is positive, `scale` of a real number.
 | `real(scale)` | any number | the number / scale |
 | `POSITIVE` | above 0 | its logarithm |
 | `bounded(low, high)` | between the bounds | its logit |
-| `CHOLESKY` | positive definite matrix (n, n) | Cholesky factor, diagonal as logarithms |
+| `CHOLESKY` | positive definite matrix (n, n) | logarithms of the standard deviations; below them |
+
+Below the diagonal theta is asinh(L_ij / L_ii), with the Cholesky factor L: of two numbers this is
+Fisher's z of their correlation, atanh(r). So theta is the same in any units, but for a shift of the
+logarithms, and all of its numbers are covariances.
 """
 
 import math
@@ -55,9 +59,8 @@ def _real_inverse(value: Any, scale: Any) -> Any:
     return value / value.__array_namespace__().asarray(scale, dtype=value.dtype)
 
 
-def _always(value: np.ndarray, *_: Any) -> bool:
-    del value
-    return True
+def _has_its_scale(value: np.ndarray, scale: Any) -> bool:
+    return np.ndim(scale) == 0 or np.shape(value)[-1:] == (len(scale),)
 
 
 def _exp(theta: Any) -> Any:
@@ -104,35 +107,52 @@ def _triangle(size: int) -> tuple[np.ndarray, np.ndarray]:
 def _of_cholesky(theta: Any) -> Any:
     xp = theta.__array_namespace__()
     units, diagonal = _triangle((math.isqrt(8 * theta.shape[0] + 1) - 1) // 2)
-    numbers = xp.where(xp.asarray(diagonal), xp.exp(theta), theta)
-    root = xp.einsum("p,pij->ij", numbers, xp.asarray(units, dtype=theta.dtype))
+    below = ~xp.asarray(diagonal)
+    numbers = xp.where(below, xp.sinh(xp.where(below, theta, 0.0)), 1.0)
+    ratios = xp.einsum("p,pij->ij", numbers, xp.asarray(units, dtype=theta.dtype))
+    rows = ratios / xp.sqrt(xp.sum(ratios**2, axis=1, keepdims=True))
+    root = xp.exp(theta[np.flatnonzero(diagonal)])[:, None] * rows
     return root @ root.T
 
 
 def _to_cholesky(value: Any) -> Any:
     xp = value.__array_namespace__()
     units, diagonal = _triangle(value.shape[0])
+    units = xp.asarray(units, dtype=value.dtype)
     root = xp.linalg.cholesky(value)
-    numbers = xp.einsum("ij,pij->p", root, xp.asarray(units, dtype=value.dtype))
-    diagonal = xp.asarray(diagonal)
-    return xp.where(diagonal, xp.log(xp.where(diagonal, numbers, 1.0)), numbers)
+    below = xp.arcsinh(xp.einsum("ij,pij->p", root / xp.diagonal(root)[:, None], units))
+    logs = xp.einsum("i,pii->p", xp.log(xp.diagonal(value)) / 2, units)
+    return xp.where(xp.asarray(diagonal), logs, below)
 
 
 def _is_positive_definite(value: np.ndarray) -> bool:
-    square = value.ndim == 2 and value.shape[0] == value.shape[1]
-    if not square or not np.allclose(value, value.T, rtol=1e-5, atol=0.0):
+    if value.ndim != 2 or not value.size or value.shape[0] != value.shape[1]:
         return False
-    return bool(np.linalg.eigvalsh(value)[0] > 0.0)
+    std = np.sqrt(np.abs(np.diagonal(value)))
+    if not (std > 0.0).all() or not np.allclose(value, value.T, rtol=1e-5, atol=0.0):
+        return False
+    try:
+        return bool(np.isfinite(np.linalg.cholesky(value / std / std[:, None])).all())
+    except np.linalg.LinAlgError:
+        return False
 
 
-REAL = Transform(_real_forward, _real_inverse, _always, "a number", (1.0,))
+REAL = Transform(_real_forward, _real_inverse, _has_its_scale, "a number", (1.0,))
 """Any number, as it is."""
 
 POSITIVE = Transform(_exp, _log, _is_positive, "positive")
 """Numbers above 0, by their logarithm."""
 
 CHOLESKY = Transform(_of_cholesky, _to_cholesky, _is_positive_definite, "positive definite")
-"""A symmetric, positive definite matrix (n, n), by its Cholesky factor."""
+"""A symmetric, positive definite matrix (n, n), by deviations and its Cholesky factor."""
+
+
+def _numbers(x: Any) -> np.ndarray | None:
+    """An array of floats, or None if it is none."""
+    try:
+        return np.asarray(x, float)
+    except (TypeError, ValueError):
+        return None
 
 
 def real(scale: float | tuple[float, ...]) -> Transform:
@@ -141,10 +161,13 @@ def real(scale: float | tuple[float, ...]) -> Transform:
     Raises:
         ValueError: A scale is not positive and finite.
     """
-    scales = np.atleast_1d(np.asarray(scale, float))
-    if not (np.isfinite(scales) & (scales > 0.0)).all():
-        raise ValueError(f"scale is {scale!r}, not positive and finite")
-    return REAL._replace(constants=(scale if np.ndim(scale) == 0 else tuple(scales.tolist()),))
+    array = _numbers(scale)
+    if array is None or array.ndim > 1 or not (np.isfinite(array) & (array > 0.0)).all():
+        raise ValueError(f"scale is {scale!r}, not positive and finite, one number or one for each")
+    if not array.ndim:
+        return REAL._replace(constants=(float(array),))
+    text = f"numbers (..., {len(array)}) as their scale is"
+    return REAL._replace(text=text, constants=(tuple(array.tolist()),))
 
 
 def positive(scale: float) -> Transform:
@@ -153,7 +176,8 @@ def positive(scale: float) -> Transform:
     Raises:
         ValueError: The scale is not positive and finite.
     """
-    if not 0.0 < scale < math.inf:
+    array = _numbers(scale)
+    if array is None or array.ndim or not 0.0 < array < math.inf:
         raise ValueError(f"scale is {scale!r}, not positive and finite")
     return Transform(_exp_scaled, _log_scaled, _is_positive, "positive", (scale,))
 
@@ -164,8 +188,9 @@ def bounded(low: float, high: float) -> Transform:
     Raises:
         ValueError: The bounds are not finite, or not in this order.
     """
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"bounds are {low} and {high}, not finite and in order")
+    arrays = _numbers(low), _numbers(high)
+    if any(x is None or x.ndim or not np.isfinite(x) for x in arrays) or not low < high:
+        raise ValueError(f"bounds are {low} and {high}, not finite numbers in order")
     text = f"between {low:g} and {high:g}"
     return Transform(_bounded_forward, _bounded_inverse, _is_between, text, (low, high))
 
@@ -217,23 +242,51 @@ def of_leaves(params: Any, transforms: Any = None) -> tuple[Transform, ...]:
     """
     if transforms is None:
         transforms = default_transforms(params)
-    is_leaf = _is_transform_or_none
 
     def spread(transform: Any, below: Any) -> Any:
         if transform is None:
             return default_transforms(below)
         return jax.tree.map(lambda _: transform, below)
 
-    try:
-        whole = jax.tree.map(spread, transforms, params, is_leaf=is_leaf)
-    except (ValueError, TypeError, KeyError) as error:
-        first = str(error).splitlines()[0]
-        raise ValueError(f"transforms is no tree like the parameters: {first}") from None
-    found = tuple(jax.tree.leaves(whole, is_leaf=_is_transform))
+    found = spread_leaves("transforms", transforms, params, _is_transform_or_none, spread)
     if not all(map(_is_transform, found)):
         wrong = next(x for x in found if not _is_transform(x))
         raise ValueError(f"transforms holds {wrong!r}, not a Transform, as transforms.POSITIVE")
-    return found
+    return tuple(found)
+
+
+def spread_leaves(
+    name: str, given: Any, params: Any, is_leaf: Callable[[Any], bool], spread: Callable
+) -> list[Any]:
+    """What a tree of options gives for each leaf of the parameters.
+
+    Args:
+        name: Of the options, for the message.
+        given: A tree like the parameters, whose leaves are options for all below them.
+        params: The parameters.
+        is_leaf: Whether something is an option.
+        spread: Makes of an option, and the parameters below it, the tree of those below.
+
+    Raises:
+        ValueError: It is no such tree.
+    """
+    try:
+        whole = jax.tree.map(spread, given, params, is_leaf=is_leaf)
+    except (ValueError, TypeError, KeyError) as error:
+        if isinstance(given, dict) and isinstance(params, dict) and given.keys() != params.keys():
+            parts = [
+                f"{which} {', '.join(map(str, sorted(keys, key=str)))}"
+                for which, keys in (
+                    ("lacks", params.keys() - given.keys()),
+                    ("has beside them", given.keys() - params.keys()),
+                )
+                if keys
+            ]
+            reason = f"it {' and '.join(parts)}; None stands for the default"
+        else:
+            reason = str(error).splitlines()[0]
+        raise ValueError(f"{name} is no tree like the parameters: {reason}") from None
+    return jax.tree.leaves(whole, is_leaf=lambda x: is_leaf(x) and x is not None)
 
 
 def _is_transform(x: Any) -> bool:

@@ -11,6 +11,8 @@ import optax
 from jaxslam.core.types import check_type
 from jaxslam.tuning import parameters
 
+LOSS_ROUNDING = 1e-4  # relative, by which the same loss may differ on another machine
+
 
 class TuneState(NamedTuple):
     """State of a tuning, with all that it needs to continue. P parameters, N updates in all.
@@ -81,14 +83,43 @@ def init(
     )
 
 
-def check_state(state: TuneState, num_params: int, num_updates: int) -> None:
-    """Raise ValueError unless a state is one of a tuning of P parameters by N updates."""
+def check_state(state: TuneState, start: TuneState) -> None:
+    """Raise ValueError unless a state is one of the tuning that begins with another."""
     check_type("state", state, TuneState)
-    shape = np.shape(state.theta_history)
-    if shape != (num_updates + 1, num_params):
+    shape, wanted = np.shape(state.theta_history), np.shape(start.theta_history)
+    if shape != wanted and len(shape) == 2:
         raise ValueError(
-            f"state is of {shape[0] - 1} updates of {shape[1]} parameters, not of {num_updates} of "
-            f"{num_params}"
+            f"state is of {shape[0] - 1} updates of {shape[1]} parameters, not of {wanted[0] - 1} "
+            f"of {wanted[1]}"
+        )
+    for field in (name for name in TuneState._fields if name != "optimizer_state"):
+        found, right = np.shape(getattr(state, field)), np.shape(getattr(start, field))
+        if found != right:
+            raise ValueError(f"state.{field} has the shape {found}, not {right}")
+    ours, other = (
+        (jax.tree.structure(each), [np.shape(x) for x in jax.tree.leaves(each)])
+        for each in (start.optimizer_state, state.optimizer_state)
+    )
+    if ours != other:
+        raise ValueError("state is of another optimizer, or other parameters were frozen")
+    first = state.theta_history[0]
+    if state.step > 0 and not np.allclose(first, start.theta, rtol=1e-5, atol=1e-5):
+        raise ValueError("state is of a tuning that began with other params or transforms")
+
+
+def check_loss_of_state(state: TuneState, value: float, size: float) -> None:
+    """Raise ValueError unless the first loss of a state is that of the tuning, to rounding.
+
+    Args:
+        state: Of an earlier call.
+        value: The loss of the tuning's first evaluation.
+        size: Mean absolute loss of its sequences.
+    """
+    first = float(state.loss[0])
+    if state.step > 0 and np.isfinite(first) and not abs(value - first) <= LOSS_ROUNDING * size:
+        raise ValueError(
+            f"state is of another model, data, loss, prior or seed: its first loss is {first:.6g}, "
+            f"not {value:.6g}"
         )
 
 
@@ -137,11 +168,12 @@ def record(state: TuneState, value: float, validation: float, skipped: int) -> T
 
 
 def _best(state: TuneState, whole: bool) -> int:
-    """Number of the best evaluation: by held-out loss, else by comparable losses, else the last."""
+    """Number of the best evaluation: by held-out or comparable losses, else the last finite one."""
     for series in (state.heldout, state.loss) if whole else (state.heldout,):
         if np.isfinite(series).any():
-            return int(np.nanargmin(series))
-    return int(state.step) - 1
+            return int(np.nanargmin(np.where(np.isfinite(series), series, np.nan)))
+    finite = np.flatnonzero(np.isfinite(state.loss[: state.step]))
+    return int(finite[-1]) if finite.size else int(state.step) - 1
 
 
 def stalled(state: TuneState, patience: int | None) -> bool:

@@ -20,6 +20,7 @@ from jaxslam.tuning import fitting, losses
         (["--batch", 0], "--batch: 0 is not between 1 and"),
         (["--updates", 0], "--updates: 0 is not between 1 and"),
         (["--patience", 0], "--patience: 0 is not between 1 and"),
+        (["--patience", 3, "--heldout", 0], "--patience: needs held-out runs"),
         (["--seed", -1], "--seed: -1 is not between 0 and"),
         (["--trials", 0], "--trials: 0 is not between 1 and"),
         (["--heldout", -1], "--heldout: -1 is not between 0 and"),
@@ -160,6 +161,15 @@ def test_an_interrupt_before_the_first_evaluation_leaves_nothing(
     assert main.main(["tune", str(drives), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "jaxslam: interrupted, nothing written"
     assert [file.name for file in tmp_path.iterdir()] == ["drives"]
+
+
+def test_a_tuning_that_has_nothing_to_minimise_is_one_line(tmp_path, capsys, monkeypatch, drives):
+    values = np.array([np.nan]), np.full((1, 8), np.nan)
+    monkeypatch.setattr(tune_command, "enable_caches", lambda: None)
+    monkeypatch.setattr(fitting, "gradients_of", lambda *_: values)
+    assert main.main(["tune", str(drives), "--out", str(tmp_path / "out")]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "the loss and gradient of none of 1 sequences are finite; look for" in last
 
 
 def test_an_interrupt_during_the_evaluation_says_where_the_noise_is(

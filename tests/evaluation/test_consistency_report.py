@@ -263,6 +263,8 @@ def test_one_trial_needs_no_axis_and_lists_will_do():
     v, S, _, _ = kalman(9, trials=1, steps=30)
     one = report_metrics(consistency_report(v[0].tolist(), S[0].astype(np.float64)))
     assert one == report_metrics(consistency_report(v, S))
+    columns = consistency_report(v[0, ..., None], S[0]), consistency_report(v[..., None], S)
+    assert all(report_metrics(report) == one for report in columns)
     few = consistency_report([[0.3], [-0.1]], [[1.0]])
     assert few.consistent and few.nis.num_values == 2
     single = consistency_of_nis([1.0], 1)
@@ -287,6 +289,12 @@ def test_one_trial_needs_no_axis_and_lists_will_do():
         ({"error_covariances": np.eye(3)}, "errors is missing"),
         ({"errors": np.zeros((5, 3)), "error_covariances": np.zeros((3, 3))}, "not positive def"),
         ({"names": ["a"]}, r"names is \['a'\], not a name for each of 2"),
+        ({"names": ["a", "a"]}, "two components have one name"),
+        ({"error_mask": np.ones(5, bool)}, "errors is missing: error_mask is of them"),
+        (
+            {"innovations": np.full((5, 2), 1e200)},
+            r"square of innovations\[0, 0\] is inf; leave it",
+        ),
         ({"num_lags": 5}, "num_lags is 5, but the longest series has 5 values"),
         ({"num_lags": 0}, "num_lags is 0, not a whole number"),
     ],
@@ -306,6 +314,38 @@ def test_the_covariance_that_is_not_positive_definite_is_named_by_its_step():
     mask = np.ones((3, 7), bool)
     mask[1, 4] = False
     assert consistency_report(np.ones((3, 7, 2)), S, mask=mask).nis.num_values == 20
+
+
+def test_a_few_giant_innovations_do_not_hide_in_the_scatter_that_they_make():
+    """Four headings of 200 are not wrapped: the mean of NIS is 300, and so is its own error."""
+    v, S, _, _ = kalman(3, trials=1, steps=200)
+    assert consistency_report(v, S).consistent
+    turned = v.copy()
+    turned[0, ::50, 1] += 2 * np.pi
+    found = consistency_report(turned, S)
+    assert str(found).splitlines() == list(found.verdicts)
+    assert not found.consistent and abs(found.nis.score) < 3.0
+    (verdict,) = (line for line in found.verdicts if "outliers" in line)
+    worst = int(np.argmax(found.nis.values))
+    assert verdict.startswith("4 of 200 steps are outliers: NIS is ")
+    assert f"at step [{worst}], of 2 dof" in verdict and "not wrapped" in verdict
+
+
+def test_innovations_of_right_filters_are_rarely_outliers():
+    """One of 400 reports is expected to name one, at a probability of 0.27 %."""
+    rng = np.random.default_rng(0)
+    reports = [consistency_report(rng.normal(size=(50, 2)), np.eye(2)) for _ in range(300)]
+    assert sum("outliers" in line for report in reports for line in report.verdicts) <= 4
+
+
+def test_a_constant_innovation_is_a_bias_though_it_has_no_scatter():
+    found = consistency_report(np.ones((200, 2)), np.eye(2))
+    assert not found.consistent and found.verdicts[0].startswith("a bias: innovations have the mea")
+
+
+def test_one_step_is_not_said_to_be_white():
+    one = consistency_report([[0.3, -0.5]], np.eye(2))
+    assert one.consistent and one.verdicts[0].endswith("too few to say whether they are white")
 
 
 @pytest.mark.parametrize(

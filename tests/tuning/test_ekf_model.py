@@ -168,7 +168,8 @@ WRONG = {
         "measurement_cov": lambda params, x: params["scale"]
     },
     "motion(params, state, input): TypeError:": {"motion": lambda params, x: x},
-    "angle 7 is named of 3 numbers": {"state_angles": (7,)},
+    "state_angles names 7 of 3 numbers": {"state_angles": (7,)},
+    "state_angles has 2 bools, but there are 3 numbers": {"state_angles": (True, False)},
     "init(params, sequence) returns no pair": {"init": lambda params, sequence: jnp.zeros(3)},
     "init(params, sequence): covariance returns float64 (3,)": {
         "init": lambda params, sequence: (jnp.zeros(3), jnp.ones(3))
@@ -191,12 +192,60 @@ def test_data_that_do_not_fit_are_one_line():
         ),
         "data.mask is float64": EkfSequence(INPUTS, Y, np.ones((B, T, M))),
         "data.inputs is float64 (3, 5, 3)": EkfSequence(INPUTS[:, 1:], Y),
-        "data.inputs holds numbers that are not finite": EkfSequence(INPUTS * np.inf, Y),
+        "data.inputs[0, 0, 0] is -inf: inputs are known": EkfSequence(INPUTS * np.inf, Y),
+        "data.mask is False everywhere": EkfSequence(INPUTS, Y, np.zeros((B, T, M), bool)),
+        "data.measurements is (3, 0, 2): nothing was": EkfSequence(None, Y[:, :0]),
+        "data[1] is ndarray, not EkfSequence": [EkfSequence(INPUTS[0], Y[0]), Y[1]],
+        "data[1] has other fields, or arrays": [
+            EkfSequence(INPUTS[0], Y[0]),
+            EkfSequence(INPUTS[1, :, :1], Y[1]),
+        ],
         "data is tuple, not EkfSequence": (INPUTS, Y),
     }.items():
         with pytest.raises(ValueError) as error:
             fitting.values(LINEAR, PARAMS, data)
         assert message in str(error.value) and "\n" not in str(error.value)
+
+
+class Unhashable:
+    """A function that cannot be static under jit."""
+
+    __hash__ = None
+
+    def __call__(self, params, x):
+        return x
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"measure": 3}, "measure is int, not a function"),
+        ({"measure": Unhashable()}, "measure is .*, which has no hash"),
+        ({"predict_first": "no"}, "predict_first is 'no', not True or False"),
+        ({"state_angles": "ab"}, "state_angles is 'ab', not indices"),
+    ],
+)
+def test_what_makes_no_model_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        linear(**changes)
+
+
+def test_sequences_of_different_lengths_have_the_likelihood_of_each_alone():
+    """They are padded; masks by step, whole numbers and lists are taken."""
+    whole = np.round(3 * Y)
+    lengths, by_step = (T, 2, 4), MASK[..., 0]
+    parts = [
+        EkfSequence(INPUTS[b, :t], whole[b, :t].astype(int), by_step[b, :t])
+        for b, t in enumerate(lengths)
+    ]
+    found = fitting.values(LINEAR, PARAMS, parts)
+    for b, t in enumerate(lengths):
+        mask = np.repeat(by_step[b, :t, None], M, axis=1)
+        total = textbook(1.1, 0.8, INPUTS[b, :t], whole[b, :t], mask)[0]
+        np.testing.assert_allclose(found[b], -total / max(mask.sum(), 1), rtol=1e-10)
+    lists = EkfSequence(INPUTS, whole.tolist(), np.repeat(by_step[..., None], M, axis=2).tolist())
+    same = fitting.values(LINEAR, PARAMS, EkfSequence(INPUTS, whole, by_step))
+    np.testing.assert_array_equal(fitting.values(LINEAR, PARAMS, lists), same)
 
 
 def test_a_model_whose_state_changes_is_refused():

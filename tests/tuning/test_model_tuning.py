@@ -111,7 +111,7 @@ def test_minibatches_held_out_data_and_resuming_work_as_for_the_filter():
         ({"y": "text"}, {}, r"data\['y'\] is <U4 \(\), not an array of numbers"),
         ({}, {}, "data holds no arrays"),
         (DATA, {"loss": "pose_nll"}, "loss .*pose_nll.* is of episodes, which data are not"),
-        (DATA, {"heldout": {"x": DATA["y"]}}, "heldout is .*, not .* as the data to tune on"),
+        (DATA, {"heldout": {"x": DATA["y"]}}, r"heldout is \['x'\], not \['y'\] as the data"),
         (DATA, {"prior": {"mean": 3.0}}, "prior is no tree"),
         (DATA, {"frozen": ("y",)}, "no parameter is called 'y'; known: mean, std"),
     ],
@@ -122,7 +122,7 @@ def test_data_that_do_not_fit_are_refused(data, changes, message):
 
 
 def test_what_is_no_model_is_refused():
-    with pytest.raises(ValueError, match="config is function, not Config or a tuning.Model"):
+    with pytest.raises(ValueError, match="model is function, not Config or a tuning.Model"):
         fitting.tune(step, START, DATA)
     with pytest.raises(ValueError, match="model.step is None, not a function"):
         fitting.tune(NORMAL._replace(step=None), START, DATA)

@@ -40,8 +40,9 @@ def test_the_flat_vector_is_that_of_the_leaves_in_the_order_of_their_names():
         *("share", "shift[0,0]", "shift[0,1]", "std[0]", "std[1]"),
     )
     root = np.linalg.cholesky(COV)
-    expected = [np.log(root[0, 0]), root[1, 0], np.log(root[1, 1]), root[2, 0], root[2, 1]]
-    expected += [np.log(root[2, 2]), np.log(1.2 / 2.8), 2.0, -4.0, np.log(0.1), np.log(20.0)]
+    u, log_std = np.arcsinh(root / np.diagonal(root)[:, None]), np.log(np.diagonal(COV)) / 2
+    expected = [log_std[0], u[1, 0], log_std[1], u[2, 0], u[2, 1]]
+    expected += [log_std[2], np.log(1.2 / 2.8), 2.0, -4.0, np.log(0.1), np.log(20.0)]
     np.testing.assert_allclose(theta, expected, rtol=1e-12)
     back = parameters.unflatten_params(theta, TREE, OF_TREE)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12), back, TREE)
@@ -49,6 +50,20 @@ def test_the_flat_vector_is_that_of_the_leaves_in_the_order_of_their_names():
     exact = jax.jacfwd(lambda x: jnp.concatenate([0.2 * jnp.ones(1), jnp.exp(x)]))(theta[-2:])
     np.testing.assert_allclose(slopes[-2:, -2:], exact[1:], rtol=1e-6)
     assert slopes.shape == (14, 11)
+
+
+def test_a_covariance_has_the_same_numbers_in_all_units_but_for_the_logarithms():
+    units = np.diag([1e-3, 1.0, 1e6])
+    diagonal = np.array([True, False, True, False, False, True])
+    theta, scaled = (CHOLESKY.inverse(cov) for cov in (COV, units @ COV @ units))
+    np.testing.assert_allclose(scaled[~diagonal], theta[~diagonal], rtol=1e-9)
+    np.testing.assert_allclose((scaled - theta)[diagonal], np.log(np.diagonal(units)), atol=1e-12)
+    correlation = COV[1, 0] / np.sqrt(COV[0, 0] * COV[1, 1])
+    np.testing.assert_allclose(theta[1], np.arctanh(correlation), rtol=1e-12)
+    slopes = jax.jacfwd(CHOLESKY.forward)(jnp.asarray(theta))
+    for i, e in enumerate(1e-6 * np.eye(6)):
+        difference = (CHOLESKY.forward(theta + e) - CHOLESKY.forward(theta - e)) / 2e-6
+        np.testing.assert_allclose(slopes[..., i], difference, atol=1e-8)
 
 
 def test_names_freeze_a_number_a_leaf_or_a_part_of_the_tree():
@@ -84,7 +99,27 @@ def test_defaults_are_by_the_kind_of_record():
         ({"cov": -COV}, OF_TREE, "params.cov is .*, not positive definite and finite"),
         ({"shift": np.array([[np.nan, 0.0]])}, OF_TREE, r"params.shift is \[\[nan, 0.0\]\], not f"),
         ({"share": "a"}, OF_TREE, "params.share is a str, not a number"),
-        ({}, {"std": POSITIVE}, "transforms is no tree like the parameters"),
+        (
+            {},
+            {"std": POSITIVE},
+            "transforms is no tree like the parameters: it lacks cov, share, s",
+        ),
+        ({}, OF_TREE | {"x": REAL}, "like the parameters: it has beside them x; None"),
+        ({"std": np.array([True, True])}, OF_TREE, "params.std is an array of bool, not a number"),
+        ({"std": "1"}, OF_TREE, "params.std is a str, not a number"),
+        ({"std": 1e400}, OF_TREE, "params.std is inf, not positive and finite"),
+        ({"cov": np.ones((2, 2))}, OF_TREE, "params.cov is .*, not positive definite"),
+        ({"cov": np.zeros((0, 0))}, OF_TREE, r"params.cov is \[\], not positive definite"),
+        (
+            {"cov": COV.tolist()},
+            OF_TREE,
+            r"params.cov\[0\]\[0\] is of the shape \(\), not a matrix",
+        ),
+        (
+            {},
+            OF_TREE | {"std": real((1.0, 1.0, 2.0))},
+            r"std is .*, not numbers \(..., 3\) as their",
+        ),
         ({}, OF_TREE | {"std": 3}, "transforms holds 3, not a Transform"),
     ],
 )
@@ -96,8 +131,12 @@ def test_parameters_outside_their_domain_are_refused_by_name(changes, given, mes
 def test_impossible_transforms_are_refused():
     with pytest.raises(ValueError, match="scale is 0.0, not positive"):
         real(0.0)
+    with pytest.raises(ValueError, match="scale is 'a', not positive"):
+        real("a")
     with pytest.raises(ValueError, match="bounds are 2.0 and 1.0"):
         bounded(2.0, 1.0)
+    with pytest.raises(ValueError, match="bounds are a and 1.0, not finite numbers"):
+        bounded("a", 1.0)
     with pytest.raises(ValueError, match="params holds no numbers"):
         parameters.as_params({})
 
@@ -122,7 +161,19 @@ def test_a_prior_is_the_normal_density_of_the_unconstrained_numbers():
 @pytest.mark.parametrize(
     "prior, message",
     [
-        ({"std": None}, "prior is no tree like the parameters"),
+        ({"std": None}, "prior is no tree like the parameters: it lacks cov, share, shift"),
+        (
+            dict.fromkeys(TREE) | {"std": Prior([1, 2, 3], 1.0)},
+            "prior of std is .*, not numbers, one",
+        ),
+        (
+            dict.fromkeys(TREE) | {"std": Prior("a", 1.0)},
+            "prior of std is .*, not numbers, one for",
+        ),
+        (
+            dict.fromkeys(TREE) | {"std": Prior(1.0, 1e-200)},
+            "prior of std is .*, not .* both finite",
+        ),
         (dict.fromkeys(TREE, 3.0), "prior is no tree of Priors"),
         (dict.fromkeys(TREE) | {"std": Prior(-1.0, 1.0)}, "not a mean that is positive"),
         (dict.fromkeys(TREE) | {"std": Prior(1.0, 0.0)}, "a positive standard deviation"),

@@ -53,9 +53,9 @@ def with_features(**changes):
 BAD_ARGUMENTS = [
     (
         (PARAMS, CONFIG, EPISODES),
-        "config is NoiseParams, not Config or a tuning.Model; the order is config, params",
+        "model is NoiseParams, not Config or a tuning.Model; the order is model, params",
     ),
-    ((CONFIG.filter, PARAMS, EPISODES), "config is FilterConfig, not Config"),
+    ((CONFIG.filter, PARAMS, EPISODES), "model is FilterConfig, not Config"),
     ((CONFIG, EPISODES, PARAMS), "params is Episode, not NoiseParams"),
     ((CONFIG, dict(PARAMS._asdict()), EPISODES), "params is dict, not NoiseParams"),
     ((CONFIG, PARAMS, [EPISODES]), r"episodes.odometry is float64 \(1, 3, 4, 3\), not floating"),

@@ -117,7 +117,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     axis.margins(y=0.15)
     axis.set(ylabel="jaxslam / dynamax")
     axis.set_title(f"likelihood and its gradient, {numbers['trials']} trials", fontsize=10)
-    axis.legend(fontsize="small", loc="upper right", bbox_to_anchor=(1.0, 0.9))
+    axis.legend(fontsize="small", loc="upper right", bbox_to_anchor=(1.0, 0.86))
     figure.savefig(path)
 
 

@@ -127,10 +127,11 @@ def draw(numbers: common.Numbers, path: Path) -> None:
         axes[0, 0].errorbar(place + side, mean, 2 * error, capsize=3, **style)
         axes[0, 1].plot(place + side, rmse, marker, color=colour, label=name)
     axes[0, 0].axhline(1.0, color=common.BLACK, linewidth=0.8)
-    axes[0, 0].set(ylabel="pose NEES per degree of freedom, +- 2 standard errors")
+    axes[0, 0].set(ylabel="pose NEES per degree of freedom")
     axes[0, 1].set(ylabel="position RMSE [cm]")
+    common.log_scale(axes[0, 0])
+    axes[0, 0].set_title("bars: 2 standard errors", fontsize="small")
     for axis in axes[0]:
-        common.log_scale(axis)
         axis.set_xticks(place, labels)
         axis.set_xlabel("standard deviations assumed, by the true ones")
         axis.grid(axis="y", alpha=0.3)

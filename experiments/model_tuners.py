@@ -5,8 +5,8 @@ model. Adam takes ten times as many updates as this library's L-BFGS, searches e
 often, kalman-py takes what it takes by default. The clock starts after a short call of each
 method, which compiles what can be kept; dynamax's own fit and kalman-py compile anew each time.
 
-dynamax: of its nonlinear models it fits no parameters, so Adam descends its likelihood. Its SGD fits
-the linear model, motion and measurement fixed. Its EM cannot: it fits them, too, or nothing.
+dynamax fits no parameters of nonlinear models, so Adam descends its likelihood. Its own SGD fits
+the linear model, motion and measurement fixed; its EM cannot: it fits all parameters or none.
 """
 
 from collections.abc import Callable

@@ -10,6 +10,7 @@ the linear model, motion and measurement fixed; its EM cannot: it fits all param
 """
 
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from time import perf_counter
 from typing import Any
@@ -184,25 +185,30 @@ LINEAR_TUNERS = TUNERS | {
 def rows_of(
     name: str, task: Task, tuners: Any, seed: int, num_updates: int, cache: ResultCache
 ) -> list[Numbers]:
-    """A row for each method: log-likelihood for each number measured, largest error, seconds.
+    """A row for each method: loss, the largest error of a parameter (a logarithm), and seconds.
 
-    A method whose library is missing is left out, with a line that says so.
+    The loss is the negative log-likelihood for each number measured. A method whose library is
+    missing is left out, with a line that says so.
     """
     rows = [_row(task, "truth", task.params, 0.0)]
     for method, make in tuners.items():
-
-        def timed(method: str = method, make: Callable[[Task, int], Tuner] = make) -> Numbers:
-            tune, start = make(task, seed), start_of(task, seed)
-            tune(start, 1)  # compiles
-            begin = perf_counter()
-            found = jax.tree.map(float, tune(start, num_updates))
-            return _row(task, method, found, perf_counter() - begin)
-
         try:
-            rows.append(cache(f"{name} {method}", timed))
+            own = partial(_timed, task, method, make, seed, num_updates)
+            rows.append(cache(f"{name} {method}", own))
         except ImportError as error:
             print(f"left out: {method}, as {error.name} is missing; pip install '.[bench]'")
     return rows
+
+
+def _timed(
+    task: Task, method: str, make: Callable[[Task, int], Tuner], seed: int, num_updates: int
+) -> Numbers:
+    """The row of a method, after a short call of it."""
+    tune, start = make(task, seed), start_of(task, seed)
+    tune(start, 1)  # compiles
+    begin = perf_counter()
+    found = jax.tree.map(float, tune(start, num_updates))
+    return _row(task, method, found, perf_counter() - begin)
 
 
 def _row(task: Task, method: str, params: Any, seconds: float) -> Numbers:

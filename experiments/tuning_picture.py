@@ -31,9 +31,9 @@ def draw(numbers: common.Numbers, path: Path) -> None:
         _draw_traces(right, numbers, data, "evaluations")
     for axis, (name, rows) in zip(axes[-3], models.items(), strict=True):
         found = [row for row in rows if row["method"] != "truth"]
-        _draw_bars(axis, found, "error")
+        _draw_found(axis, found, "error")
         axis.set(xlabel="largest error of a logarithm", title=f"{name}: parameters found")
-    _draw_bars(axes[-2, 0], calibrated, "heldout_rmse_m", 100.0)
+    _draw_found(axes[-2, 0], calibrated, "heldout_rmse_m", 100.0)
     axes[-2, 0].set(xlabel="held-out position RMSE [cm]", title="calibration of a robot")
     _draw_adapted(axes[-2, 1], numbers["rows"], shown)
     for axis in axes[-1]:
@@ -62,19 +62,24 @@ def _draw_traces(axis: Any, numbers: common.Numbers, data: str, over: str) -> No
     axis.legend(fontsize="small")
 
 
-def _draw_bars(axis: Any, rows: list[common.Numbers], key: str, unit: float = 1.0) -> None:
-    """A bar for each method, with its value, NEES where there is one, and seconds, if any."""
-    values = np.array([unit * row[key] for row in rows])
-    colours = [common.GREEN if row["method"] in OWN else common.SKY for row in rows]
-    axis.barh(np.arange(len(rows)), values, color=colours)
+def _draw_found(axis: Any, rows: list[common.Numbers], key: str, unit: float = 1.0) -> None:
+    """A point for each method; beside it, NEES or loss, and seconds if there are any."""
+    values = unit * np.array([row[key] for row in rows], float)  # NaN where nothing was finite
+    low, high = np.nanmin(values) / 1.5, max(np.nanmax(values), 3 * np.nanmin(values))
     for place, (value, row) in enumerate(zip(values, rows, strict=True)):
-        text = f" {value:.2g}"
-        text += f", NEES {row['nees']:.2g}" if row.get("nees") else ""
-        text += f", {row['seconds']:.2g} s" if row["seconds"] else ""
+        colour = common.GREEN if row["method"] in OWN else common.BLUE
+        axis.plot([low, value], [place, place], color=colour, linewidth=0.8)
+        axis.plot(value, place, "o", color=colour)
+        text = f"   {value:.3g}"
+        text += f"; NEES {row['nees']:.3g}" if row.get("nees") else ""
+        text += f"; loss {row['loss']:.4f}" if "loss" in row else ""
+        text += f"; {row['seconds']:.2g} s" if row["seconds"] else ""
         axis.text(value, place, text, va="center", fontsize="small")
-    axis.set_yticks(np.arange(len(rows)), [row["method"] for row in rows], fontsize="small")
-    axis.invert_yaxis()
-    axis.set(xscale="log", xlim=(values.min() / 2, values.max() * 20))  # what stands beside a bar
+    common.log_scale(axis, "x")
+    axis.set(xlim=(low, high * (high / low) ** 1.2))  # what stands beside a point
+    names = [row["method"].replace(", noise", ",\nnoise") for row in rows]
+    axis.set_yticks(np.arange(len(rows)), names, fontsize="small")
+    axis.set(ylim=(len(rows) - 0.5, -0.5))
 
 
 def _draw_adapted(axis: Any, rows: list[common.Numbers], shown: list[str]) -> None:
@@ -92,7 +97,8 @@ def _draw_adapted(axis: Any, rows: list[common.Numbers], shown: list[str]) -> No
             axis.text(x + 0.05, y, text, va="center", fontsize="small")
     axis.axhline(1.0, color=common.BLACK, linewidth=0.8)
     axis.set_xticks(place, [name.replace(", ", ",\n") for name in ADAPTED])
-    axis.set(xlim=(-0.5, len(ADAPTED)), ylabel="held-out NEES per dof, beside it RMSE")
-    axis.set_title("online adaptation of Q and R")
+    axis.set(xlim=(-0.5, len(ADAPTED)), ylabel="held-out NEES per dof")
+    axis.set_title("online adaptation of Q and R; beside the points: RMSE")
     common.log_scale(axis)
+    axis.margins(y=0.2)
     axis.legend(fontsize="small")

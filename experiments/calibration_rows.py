@@ -34,8 +34,18 @@ def compute(
         "hand": calibration.uncalibrated(),
     }
     rows = [_row(method, params, 0.0, test) for method, params in known.items()]
-    rows += cache("calibration closed form", partial(_closed_form, train, test))["rows"]
+    for name, make in (("noise alone", _noise_alone), ("closed form", _closed_form)):
+        rows += cache(f"calibration {name}", partial(make, train, test))["rows"]
     return [*rows, cache("calibration gradient", partial(_gradient, train, test))]
+
+
+def _noise_alone(train: Episode, test: Episode) -> common.Numbers:
+    """No calibration, and the noise tuned for that."""
+    hand = calibration.uncalibrated()
+    _compile(hand, train)
+    begin = perf_counter()
+    params = _tune_noise(hand, train)
+    return {"rows": [_row("noise by gradient", params, perf_counter() - begin, test)]}
 
 
 def _closed_form(train: Episode, test: Episode) -> common.Numbers:
@@ -45,17 +55,16 @@ def _closed_form(train: Episode, test: Episode) -> common.Numbers:
     begin = perf_counter()
     own = hand._replace(calibration=calibration.closed_form_of(train))
     seconds = perf_counter() - begin
-    found = fitting.tune(
-        calibration.MODEL,
-        own,
-        train,
-        loss=LOSS,
-        num_updates=calibration.UNCALIBRATED_UPDATES,
-        frozen=("calibration",),
-    )
+    params = _tune_noise(own, train)
     both = perf_counter() - begin
-    rows = [("closed form", own, seconds), ("closed form, noise by gradient", found.params, both)]
+    rows = [("closed form", own, seconds), ("closed form, noise by gradient", params, both)]
     return {"rows": [_row(*row, test) for row in rows]}
+
+
+def _tune_noise(params: CalibratedParams, train: Episode) -> CalibratedParams:
+    updates = calibration.UNCALIBRATED_UPDATES
+    options = {"loss": LOSS, "num_updates": updates, "frozen": ("calibration",)}
+    return fitting.tune(calibration.MODEL, params, train, **options).params
 
 
 def _gradient(train: Episode, test: Episode) -> common.Numbers:

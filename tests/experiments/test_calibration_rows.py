@@ -60,7 +60,7 @@ def test_the_closed_form_and_tune_start_alike_and_are_evaluated_on_other_drives(
     cache = common.ResultCache(tmp_path / "cache", "x")
     rows = calibration_rows.compute(0, 3, 2, cache)
     noise_by_gradient = "closed form, noise by gradient"
-    methods = ["truth", "hand", "closed form", noise_by_gradient, "gradient"]
+    methods = ["truth", "hand", "noise by gradient", "closed form", noise_by_gradient, "gradient"]
     assert [row["method"] for row in rows] == methods and all(n == 2 for _, n in asked)
     error = {row["method"]: row["error"] for row in rows}
     truth = HURT.calibration()
@@ -74,8 +74,10 @@ def test_the_closed_form_and_tune_start_alike_and_are_evaluated_on_other_drives(
     given = dict(zip(methods, (params for params, _ in asked), strict=True))
     for method in ("hand", "closed form", "gradient"):
         np.testing.assert_allclose(parameters.flatten_params(given[method].noise), hand)
-    assert given[noise_by_gradient].noise == "tuned"
-    assert [options["frozen"] for _, options in tuned if "frozen" in options] == [("calibration",)]
+    assert given[noise_by_gradient].noise == given["noise by gradient"].noise == "tuned"
+    assert error["noise by gradient"] == common.plain(error["hand"])
+    frozen = [options["frozen"] for _, options in tuned if "frozen" in options]
+    assert frozen == 2 * [("calibration",)]
     count = len(asked)
     again = calibration_rows.compute(0, 3, 2, cache)
     assert [row["method"] for row in again] == methods and len(asked) == count + 2  # the known

@@ -108,7 +108,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     labels = {"seconds": "time", "planned": "memory,\nplanned", "grown": "memory,\nby the process"}
     colours = (common.SKY, common.ORANGE)
     found = numbers["against_dynamax"]
-    for k, ((name, row), colour) in enumerate(zip(found.items(), colours, strict=True)):
+    for k, ((name, row), colour) in enumerate(zip(found.items(), colours, strict=False)):
         values = [row["ratio"][key] or np.nan for key in labels]
         drawn = axis.bar(np.arange(3) + 0.4 * k, values, 0.38, label=name, color=colour)
         axis.bar_label(drawn, fmt="%.2f", fontsize="small", padding=2)

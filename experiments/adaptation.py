@@ -10,17 +10,19 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jax import lax
 
 from experiments import common, exact_model
+from jaxslam.core.batching import map_batches
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.episode import Episode, measurements_of
-from jaxslam.evaluation import consistency
+from jaxslam.evaluation import consistency, summary
 from jaxslam.filtering import StepInfo, run_filter
 from jaxslam.filtering.adaptation import AdaptationSpec
 from jaxslam.filtering.config import FilterConfig, init
 from jaxslam.filtering.noise import NoiseParams
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.episodes import TrialResult
 
 NAME = "adaptation"
 FACTORS = ((1.0, 1.0), (3.0, 1.0), (1.0, 3.0), (3.0, 3.0), (1 / 3, 1 / 3), (3.0, 1 / 3))
@@ -39,19 +41,41 @@ def scaled(params: NoiseParams, by_q: float, by_r: float) -> NoiseParams:
 
 
 @partial(jax.jit, static_argnames="config")
-def _infos(config: FilterConfig, params: NoiseParams, drives: Episode) -> StepInfo:
-    """Diagnostics [B] of the filter on drives [B]."""
+def _filter(
+    config: FilterConfig, params: NoiseParams, drives: Episode
+) -> tuple[TrialResult, StepInfo]:
+    """Results [B] and diagnostics [B] of the filter on drives [B]."""
 
-    def of_drive(episode: Episode) -> StepInfo:
+    def of_drive(episode: Episode) -> tuple[TrialResult, StepInfo]:
         start = init(config, episode.truth[0])
-        return run_filter(config, params, start, measurements_of(episode))[1]
+        belief, info = run_filter(config, params, start, measurements_of(episode))
+        return episodes.trial_result(config, episode, belief, info), info
 
-    return lax.map(of_drive, drives)
+    return map_batches(of_drive, drives, batch_size=episodes.EPISODE_BATCH)
+
+
+def heldout(config: FilterConfig, params: NoiseParams, drives: Episode) -> common.Numbers:
+    """Errors on drives [B] of a filter that adapts, as of `noise_search.evaluate_heldout`.
+
+    Besides, the factors on the standard deviations of Q and of R at the end of a drive: their
+    geometric means over the drives.
+    """
+    adapting = config._replace(adaptation=AdaptationSpec())
+    results, info = _filter(adapting, params, drives)
+    found = summary.evaluate(results)
+    q, r = np.exp(np.log(np.asarray(info.noise_factors)[:, -1]).mean(axis=0))
+    return {
+        "heldout_rmse_m": found["position_rmse_m"],
+        "nees": found["nees"],
+        "diverged": found["diverged"],
+        "q_factor": q,
+        "r_factor": r,
+    }
 
 
 def run(config: FilterConfig, params: NoiseParams, drives: Episode) -> common.Numbers:
     """Results over drives [B]: mean and standard error of each measure."""
-    info = jax.tree.map(np.asarray, _infos(config, params, drives))
+    info = jax.tree.map(np.asarray, _filter(config, params, drives)[1])
     error = np.asarray(consistency.pose_error(info.pose, drives.truth))
     nees = np.asarray(consistency.nees(error, info.pose_cov))[:, 1:] / 3  # the first is certain
     numbers = {
@@ -90,17 +114,27 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     """NEES and errors of both filters for each pair of factors."""
     figure, axes = common.canvas(11, 4.2, 1, 2)
     rows = numbers["rows"]
-    labels = [f"Q {row['q_factor']:.2g}\nR {row['r_factor']:.2g}" for row in rows]
-    for name, colour in (("fixed", common.ORANGE), ("adapted", common.GREEN)):
-        nees = [row[name]["pose_nees_per_dof"]["mean"] for row in rows]
+    labels = [f"Q x {row['q_factor']:.2g}\nR x {row['r_factor']:.2g}" for row in rows]
+    place = np.arange(len(rows))
+    for name, colour, marker, side in (
+        ("fixed", common.ORANGE, "s", -0.1),
+        ("adapted", common.GREEN, "o", 0.1),
+    ):
+        nees = [row[name]["pose_nees_per_dof"] for row in rows]
+        mean, error = (np.array([x[key] for x in nees]) for key in ("mean", "standard_error"))
         rmse = [100 * row[name]["position_rmse_m"] for row in rows]
-        axes[0, 0].plot(labels, nees, "o-", color=colour, label=name)
-        axes[0, 1].plot(labels, rmse, "o-", color=colour, label=name)
+        style = {"fmt": marker, "color": colour, "label": name}
+        axes[0, 0].errorbar(place + side, mean, 2 * error, capsize=3, **style)
+        axes[0, 1].plot(place + side, rmse, marker, color=colour, label=name)
     axes[0, 0].axhline(1.0, color=common.BLACK, linewidth=0.8)
     axes[0, 0].set(ylabel="pose NEES per degree of freedom")
     axes[0, 1].set(ylabel="position RMSE [cm]")
+    common.log_scale(axes[0, 0])
+    axes[0, 0].set_title("bars: 2 standard errors", fontsize="small")
     for axis in axes[0]:
-        common.log_scale(axis)
+        axis.set_xticks(place, labels)
+        axis.set_xlabel("standard deviations assumed, by the true ones")
+        axis.grid(axis="y", alpha=0.3)
         axis.legend(fontsize="small")
     figure.savefig(path)
 

@@ -1,9 +1,8 @@
-"""An EKF of one's own functions: likelihood, time and memory beside dynamax, and tuning by others.
+"""An EKF of one's own functions: likelihood, time and memory beside dynamax.
 
 Value and gradient of the log-likelihood of many trials, on one core, after compilation: a pendulum,
-and a robot among beacons. Then parameters from a wrong start, by this library, by dynamax with
-Adam, kalman-py, Optuna and random search (`pip install '.[bench]' kalman-py`). A library that is
-missing is left out. Memory is measured in processes of their own.
+and a robot among beacons. Memory is measured in processes of their own. What others find who tune
+such models is in `experiments.tuning`.
 """
 
 import json
@@ -20,6 +19,7 @@ import numpy as np
 from experiments import common, model_tasks
 from experiments.model_tasks import MODELS, Task
 from experiments.timing import pin
+from jaxslam.io.errors import InputError
 
 NAME = "any_model"
 EXACT_TRIALS = 8  # whose likelihoods are compared in double precision
@@ -101,69 +101,47 @@ def _in_process(args: Any, worker: str) -> common.Numbers:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def compute(args: Any) -> common.Numbers:
-    """All numbers."""
-    try:
-        speed = {name: against_dynamax(args, name) for name in MODELS}
-    except ImportError:
-        print("left out: dynamax, which is missing; pip install '.[bench]'")
-        speed = {}
-    pendulum = task("pendulum", seed=args.seed, num_trials=args.sequences, num_steps=args.steps)
-    line = model_tasks.task(
-        model_tasks.LINEAR, seed=args.seed, num_trials=1, num_steps=5 * args.steps
-    )
-    tuned = {
-        "pendulum": model_tasks.tuned(pendulum, model_tasks.TUNERS, args.seed, args.updates),
-        "linear": model_tasks.tuned(line, model_tasks.LINEAR_TUNERS, args.seed, args.updates),
-    }
-    sizes = {"trials": args.trials, "steps": args.steps, "sequences": args.sequences}
-    return {"seed": args.seed, **sizes, "against_dynamax": speed, "tuned": tuned}
-
-
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """Ratios to dynamax, and the errors of parameters over time of tuning."""
-    figure, axes = common.canvas(11, 3.6, 1, 3)
-    labels = {"seconds": "time", "planned": "memory, planned", "grown": "memory, process"}
-    for k, (name, found) in enumerate(numbers["against_dynamax"].items()):
-        values = [found["ratio"][key] or np.nan for key in labels]
-        drawn = axes[0, 0].bar(np.arange(3) + 0.4 * k, values, 0.4, label=name)
-        axes[0, 0].bar_label(drawn, fmt="%.2f", fontsize="small")
-    axes[0, 0].axhline(1 / 3, color=common.BLACK, linewidth=0.8)
-    axes[0, 0].set_xticks(np.arange(3) + 0.2, labels.values(), fontsize="small")
-    axes[0, 0].set_title(f"value and gradient / dynamax's, {numbers['trials']} trials", fontsize=10)
-    axes[0, 0].legend(fontsize="small")
-    for axis, (name, rows) in zip(axes[0, 1:], numbers["tuned"].items(), strict=True):
-        for row in rows:
-            if row["method"] != "truth" and "loss" in row:
-                axis.plot(row["seconds"], row["error"], "o", label=row["method"])
-        axis.set(xlabel="seconds, with compiling", ylabel="largest |log error|")
-        axis.set_title(f"{name}: parameters found", fontsize=10)
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.legend(fontsize="x-small")
+    """Ratios to dynamax."""
+    figure, axes = common.canvas(7, 3.6, 1, 1)
+    axis = axes[0, 0]
+    labels = {"seconds": "time", "planned": "memory,\nplanned", "grown": "memory,\nby the process"}
+    colours = (common.SKY, common.ORANGE)
+    found = numbers["against_dynamax"]
+    for k, ((name, row), colour) in enumerate(zip(found.items(), colours, strict=False)):
+        values = [row["ratio"][key] or np.nan for key in labels]
+        drawn = axis.bar(np.arange(3) + 0.4 * k, values, 0.38, label=name, color=colour)
+        axis.bar_label(drawn, fmt="%.2f", fontsize="small", padding=2)
+    axis.axhline(1 / 3, color=common.BLACK, linewidth=0.8, linestyle="--", label="a third")
+    axis.set_xticks(np.arange(3) + 0.2, labels.values())
+    axis.margins(y=0.15)
+    axis.set(ylabel="jaxslam / dynamax")
+    axis.set_title(f"likelihood and its gradient, {numbers['trials']} trials", fontsize=10)
+    axis.legend(fontsize="small", loc="upper right", bbox_to_anchor=(1.0, 0.86))
     figure.savefig(path)
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Run the comparison."""
+@common.report_errors(NAME)
+def main(argv: list[str] | None = None) -> int:
+    """Run the comparison; returns the exit code, 2 without dynamax, 130 for Ctrl-C."""
     pin()
-    given = {"trials": 512, "steps": 200, "repeats": 10, "sequences": 16, "updates": 40}
-    args = common.parse(__doc__, argv, **given, worker="")
+    args = common.parse(__doc__, argv, trials=512, steps=200, repeats=10, worker="")
     if args.worker:
         name, library = args.worker.split()
         own = task(name, seed=args.seed, num_trials=args.trials, num_steps=args.steps)
         print(json.dumps(memory(own, library)))
-        return
-    numbers = compute(args)
-    common.save(args.out, NAME, numbers, draw)
-    for name, found in numbers["against_dynamax"].items():
-        ratio = {key: value and round(value, 3) for key, value in found["ratio"].items()}
-        print(f"{name}: ratios {ratio}, likelihoods differ by {found['likelihood_difference']:.1e}")
-    for name, rows in numbers["tuned"].items():
-        for row in rows:
-            shown = {k: v if isinstance(v, str | bool) else f"{v:.4g}" for k, v in row.items()}
-            print(name, shown)
+        return 0
+    try:
+        found = {name: against_dynamax(args, name) for name in MODELS}
+    except ImportError as error:
+        raise InputError("dynamax is missing; pip install '.[bench]'") from error
+    numbers = {"seed": args.seed, "trials": args.trials, "steps": args.steps}
+    common.save(args.out, NAME, numbers | {"against_dynamax": found}, draw)
+    for name, row in found.items():
+        ratio = {key: value and round(value, 3) for key, value in row["ratio"].items()}
+        print(f"{name}: ratios {ratio}, likelihoods differ by {row['likelihood_difference']:.1e}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -51,14 +51,21 @@ def true_params() -> CalibratedParams:
     return CalibratedParams(calibration_drives.measurement_noise(), HURT.calibration())
 
 
+def uncalibrated() -> CalibratedParams:
+    """A robot that is taken to be without errors, its odometry's noise large."""
+    still = true_params()._replace(calibration=Calibration.identity())
+    theta = parameters.flatten_params(still)
+    theta[:4] += np.log(CAUTION)
+    return parameters.unflatten_params(theta, still)
+
+
 def start_of(seed: int, number: int) -> CalibratedParams:
-    """A robot that is taken to be without errors, give or take a unit of each transform."""
+    """`uncalibrated`, give or take a unit of each transform, each noise within `FACTOR`."""
     truth = true_params()
     rng = np.random.default_rng([seed, number])
-    theta = parameters.flatten_params(truth._replace(calibration=Calibration.identity()))
+    theta = parameters.flatten_params(uncalibrated())
     theta[NOISE_NUMBERS:] += rng.uniform(-1.0, 1.0, len(theta) - NOISE_NUMBERS)
     theta[:NOISE_NUMBERS] += np.log(FACTOR) * rng.uniform(-1.0, 1.0, NOISE_NUMBERS)
-    theta[:4] += np.log(CAUTION)
     return parameters.unflatten_params(theta, truth)
 
 
@@ -101,7 +108,12 @@ def recover(
 
 
 def position_rmse(params: CalibratedParams, drives: Episode) -> float:
-    """Position RMSE [m] of the filter on drives [B], calibrated by the parameters."""
+    """Position RMSE [m] of `heldout`."""
+    return heldout(params, drives)["heldout_rmse_m"]
+
+
+def heldout(params: CalibratedParams, drives: Episode) -> common.Numbers:
+    """Errors of the filter on drives [B], calibrated by the parameters."""
     own = partial(
         calibrate_episode,
         params.calibration,
@@ -109,7 +121,8 @@ def position_rmse(params: CalibratedParams, drives: Episode) -> float:
         wheel_base=HURT.wheel_base,
     )
     results = episodes.filter_episodes(CONFIG, params.noise, jax.jit(jax.vmap(own))(drives))
-    return summary.evaluate(results)["position_rmse_m"]
+    found = summary.evaluate(results)
+    return {"heldout_rmse_m": found["position_rmse_m"], "nees": found["nees"]}
 
 
 def compute_loss(
@@ -221,11 +234,9 @@ def peers(train: Episode, test: Episode) -> common.Numbers:
     """Held-out errors of the robot as it is, of noise alone, and of the closed form."""
     truth = true_params()
     still = truth._replace(calibration=Calibration.identity())
-    cautious = parameters.flatten_params(still)
-    cautious[:4] += np.log(CAUTION)
     noise = fitting.tune(
         MODEL,
-        parameters.unflatten_params(cautious, still),
+        uncalibrated(),
         common.take(train, slice(PART)),
         loss=LOSSES[0],
         num_updates=UNCALIBRATED_UPDATES,

@@ -36,8 +36,10 @@ def draw(numbers: common.Numbers, path: Any) -> None:
         reference = row["known_calibration_rmse_m"]
         bars["true calibration, " + row["loss"]] = reference
         bars["tuned, " + row["loss"]] = row["heldout_ratio"][1] * reference
-    right.barh(list(bars), [100 * x for x in bars.values()], color=common.SKY)
-    for place, value in enumerate(bars.values()):
-        right.text(100 * value, place, f" {100 * value:.2f}", va="center")
+    values = 100 * np.array(list(bars.values()))
+    right.barh(list(bars), values, color=common.SKY)
+    for place, value in enumerate(values):
+        right.text(value, place, f" {value:.2f}", va="center")
     right.set(xlabel="held-out position RMSE [cm], of the worst start", xscale="log")
+    right.set_xlim(values.min() / 2, values.max() * 3)  # what stands beside a bar
     figure.savefig(path)

@@ -149,14 +149,15 @@ def canvas(width: float, height: float, rows: int, columns: int, widths: list[in
     return figure, figure.subplots(rows, columns, squeeze=False, width_ratios=widths)
 
 
-def log_scale(axis) -> None:
-    """Make the y axis logarithmic, with plain numbers at 1, 2 and 5 times the powers of ten."""
+def log_scale(axis, of: str = "y") -> None:
+    """Make an axis, "x" or "y", logarithmic, with plain numbers at 1, 2, 5 times powers of ten."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.set(**{f"{of}scale": "log"})
+    ticks = getattr(axis, f"{of}axis")
+    ticks.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ticks.set_major_formatter("{x:g}")
+    ticks.set_minor_formatter(NullFormatter())
 
 
 def scan_of(name: str, lidar: Lidar) -> Scan:

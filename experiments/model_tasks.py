@@ -1,28 +1,22 @@
-"""Models and data of `experiments.any_model`, and other libraries that tune them.
+"""Small models and simulated data of them, for `experiments.any_model` and `experiments.tuning`.
 
-All start at the same parameters, on the same simulated sequences. Parameters are logarithms.
+Parameters are logarithms.
 """
 
 from collections.abc import Callable
 from importlib import import_module
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
-from experiments.common import Numbers
-from experiments.noise_search import METHODS
 from jaxslam.core.types import Array
-from jaxslam.tuning import fitting
 from jaxslam.tuning.ekf_model import EkfSequence, ekf_model
 from jaxslam.tuning.model import Model, run_model
 
 DT = 0.05  # [s]
 BEACONS = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 8.0], [0.0, 8.0]])  # [m]
-FACTOR = 3.0  # each parameter starts this far from the truth, and is searched as far around there
 Likelihood = Callable[[Any, EkfSequence], Array]
 
 
@@ -158,105 +152,3 @@ def task(spec: Spec, *, seed: int, num_trials: int, num_steps: int) -> Task:
         x = moved + std["motion_std"] * rng.normal(size=x.shape)
     data = EkfSequence(None, jnp.asarray(np.stack(measured, axis=1), float))
     return Task(spec, model_of(spec), params, data)
-
-
-def _start(task: Task, seed: int) -> Any:
-    """Parameters off by `FACTOR`, each up or down."""
-    signs = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], len(task.params))
-    offsets = dict(zip(task.params, signs * np.log(FACTOR), strict=True))
-    return {name: value + offsets[name].item() for name, value in task.params.items()}
-
-
-def _own_tune(task: Task, start: Any, num_updates: int, seed: int) -> Any:
-    return fitting.tune(task.model, start, task.data, num_updates=num_updates).params
-
-
-def _dynamax_sgd(task: Task, start: Any, num_updates: int, seed: int) -> Any:
-    """Adam on dynamax's likelihood: of its nonlinear models it fits no parameters by itself."""
-    likelihood = jax.vmap(task.dynamax(), (None, 0))
-    optimizer = optax.adam(0.05)
-
-    def loss(params: Any) -> Array:
-        return -jnp.sum(likelihood(params, task.data)) / task.data.measurements.size
-
-    @jax.jit
-    def update(params: Any, state: Any) -> tuple[Any, Any]:
-        change, state = optimizer.update(jax.grad(loss)(params), state)
-        return optax.apply_updates(params, change), state
-
-    params, state = start, optimizer.init(start)
-    for _ in range(10 * num_updates):
-        params, state = update(params, state)
-    return params
-
-
-def _search(method: str) -> Callable[[Task, Any, int, int], Any]:
-    def run(task: Task, start: Any, num_updates: int, seed: int) -> Any:
-        sampler, best = METHODS[method](len(start), seed), (np.inf, start)
-        for _ in range(5 * num_updates):
-            point = np.log(2 * FACTOR) * sampler.propose()
-            moved = zip(start.items(), point.tolist(), strict=True)
-            params = {name: value + by for (name, value), by in moved}
-            loss = fitting.values(task.model, params, task.data).mean()
-            sampler.observe(loss)
-            best = min(best, (loss, params), key=lambda pair: pair[0])
-        return best[1]
-
-    return run
-
-
-TUNERS: dict[str, Callable[[Task, Any, int, int], Any]] = {
-    "jaxslam": _own_tune,
-    "dynamax, Adam": _dynamax_sgd,
-    "random": _search("random"),
-    "optuna": _search("bayesian"),
-}
-
-
-def _kalman_py(method: str) -> Callable[[Task, Any, int, int], Any]:
-    def run(task: Task, start: Any, num_updates: int, seed: int) -> Any:
-        learning = import_module("kalman_py.learning")
-        F = np.asarray(jax.jacfwd(lambda x: task.spec.motion(start, x))(jnp.zeros(2)), float)
-        zs = np.asarray(task.data.measurements[0], float)
-        variance = {name: float(np.exp(2 * value)) for name, value in start.items()}
-        # Its prior is that before the first motion, here the prior before it.
-        prior = np.linalg.inv(F) * task.spec.std
-        fit = learning.fit_noise(
-            F,
-            np.eye(1, 2),
-            zs,
-            np.zeros(2),
-            prior @ prior.T,
-            Q0=variance["motion_std"] * np.eye(2),
-            R0=variance["measurement_std"] * np.eye(1),
-            method=method,
-        )
-        motion = np.log(np.trace(fit.Q) / 2) / 2  # it fits a full matrix
-        return {"motion_std": motion, "measurement_std": np.log(fit.R[0, 0]) / 2}
-
-    return run
-
-
-LINEAR_TUNERS = TUNERS | {
-    "kalman-py, EM": _kalman_py("em"),
-    "kalman-py, gradient": _kalman_py("gradient"),
-}
-
-
-def tuned(task: Task, tuners: Any, seed: int, num_updates: int) -> list[Numbers]:
-    """A row for each method: log-likelihood for each number measured, error, seconds."""
-    start, rows = _start(task, seed), []
-    for name, tune in tuners.items():
-        begin = perf_counter()
-        try:
-            params = tune(task, start, num_updates, seed)
-        except ImportError:
-            rows.append({"method": name, "missing": True})
-            continue
-        seconds = perf_counter() - begin
-        params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-        off = [float(params[key] - task.params[key]) for key in task.params]
-        loss = fitting.values(task.model, params, task.data).mean()
-        rows.append({"method": name, "loss": loss, "error": np.abs(off).max(), "seconds": seconds})
-    truth = fitting.values(task.model, task.params, task.data).mean()
-    return [{"method": "truth", "loss": truth, "error": 0.0, "seconds": 0.0}, *rows]

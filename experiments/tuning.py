@@ -1,9 +1,15 @@
-"""Noise by gradient, hand-set, by likelihood, by random search and by Bayesian optimisation.
+"""Who finds the best parameters, by gradient or otherwise, on the same data from the same start.
 
-On simulated drives through the office and, with `--mrclam FOLDER`, on the MRCLAM data set there:
-robots 1 to 3 are for training, 4 and 5 held out. Each search goes on for ten times as long as the
-tuning by gradient. After that, whether tuning recovers known noise (`parameter_recovery`). The same
-command resumes where it was stopped.
+- Noise, on simulated drives through the office and, with `--mrclam FOLDER`, on the MRCLAM data set
+  there (robots 1 to 3 are for training, 4 and 5 held out): by gradient, hand-set, by likelihood, by
+  random search and by Bayesian optimisation. Each search goes on for ten times as long as the
+  tuning by gradient. Hand-set and tuned noise also with online adaptation (`adaptation`).
+- A pendulum and a linear model, tuned by other libraries (`model_tuners`).
+- Calibration of a robot, beside the closed form of Censi et al. (`calibration_rows`).
+- Whether tuning recovers known noise (`parameter_recovery`).
+
+The same command resumes where it was stopped. Methods whose library is missing are left out, with a
+line that says so.
 """
 
 import sys
@@ -11,12 +17,19 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import jax
 import numpy as np
 
-from experiments import common, noise_search, parameter_recovery
+from experiments import (
+    adaptation,
+    calibration_rows,
+    common,
+    model_tuners,
+    noise_search,
+    parameter_recovery,
+)
+from experiments.tuning_picture import draw
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.filtering.config import FilterConfig
@@ -25,7 +38,7 @@ from jaxslam.io import mrclam
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import trials
-from jaxslam.tuning import fitting
+from jaxslam.tuning import fitting, parameters
 from jaxslam.tuning.losses import Loss, innovation_nll, pose_nll
 
 NAME = "tuning"
@@ -34,14 +47,7 @@ NUM_UPDATES = {"office": 25, "mrclam": 40}
 TIMED_TRIALS = 256  # of the update that is timed
 SEARCH_TIME = 10.0  # of a search, by the time of the gradient
 LANDMARKS = 64  # capacity of the map of the office
-DATA = {"office": "office", "mrclam": "MRCLAM"}
-STYLES = {
-    "hand": (common.BLACK, ":"),
-    "gradient": (common.GREEN, "-"),
-    "likelihood": (common.PINK, "-."),
-    "random": (common.ORANGE, "--"),
-    "bayesian": (common.BLUE, "--"),
-}
+MODEL_UPDATES = 40  # of the small models
 
 
 def office(seed: int, num_trials: int, num_heldout: int) -> noise_search.Task:
@@ -101,6 +107,20 @@ def compare(
     return rows, traces
 
 
+def adapting(
+    data: str, task: noise_search.Task, own: common.Numbers, cache: common.ResultCache
+) -> list[common.Numbers]:
+    """Rows of hand-set noise and of that by gradient, whose trace is `own`, that adapts online."""
+    rows, totals = [], {"hand": (0.0, 0), "gradient": (own["seconds"], own["evaluations"])}
+    for method, point in (("hand", own["points"][0]), ("gradient", own["points"][-1])):
+        params = parameters.unflatten_params(np.array(point["theta"]), task.hand)
+        make = partial(adaptation.heldout, task.config.filter, params, task.test)
+        found = cache(f"{data} {method} adapting", make)
+        row = _row(data, f"{method}, adapting", found, *totals[method], own, found)
+        rows.append(row | {key: found[key] for key in ("q_factor", "r_factor")})
+    return rows
+
+
 def update_seconds(task: noise_search.Task) -> common.Numbers:
     """Seconds of one update over many trials, compiled; the training drives are repeated."""
     count = len(task.train.odometry)
@@ -146,43 +166,12 @@ def _row(
     }
 
 
-def draw(numbers: common.Numbers, path: Path) -> None:
-    """Held-out error over time and over evaluations; results of parameter recovery."""
-    shown = list(numbers["traces"])
-    figure, axes = common.canvas(12, 4.2 * len(shown) + 4.2, len(shown) + 1, 2)
-    for (left, right), data in zip(axes, shown, strict=False):
-        _draw_traces(left, numbers, data, "seconds")
-        _draw_traces(right, numbers, data, "evaluations")
-    for axis in axes[-1]:
-        axis.remove()
-    wide = figure.add_subplot(axes[-1, 0].get_gridspec()[len(shown), :])
-    parameter_recovery.draw(wide, numbers["recovery"])
-    figure.savefig(path)
-
-
-def _draw_traces(axis: Any, numbers: common.Numbers, data: str, over: str) -> None:
-    traces = numbers["traces"][data]
-    for method, trace in traces.items():
-        colour, style = STYLES[method]
-        points = trace["points"]
-        x = [max(point[over], 1.0) for point in points] + [trace[over]]
-        y = [100 * point["heldout_rmse_m"] for point in points]
-        axis.step(x, y + y[-1:], style, where="post", color=colour, label=method)
-        axis.plot(x[-1], y[-1], "o", color=colour, markersize=4)
-    hand = 100 * traces["gradient"]["points"][0]["heldout_rmse_m"]
-    axis.axhline(hand, color=common.BLACK, linestyle=":", label="hand")
-    axis.set(xscale="log", ylabel="held-out position RMSE [cm]")
-    common.log_scale(axis)
-    what = "evaluations of all training drives, values and gradients alike"
-    axis.set_xlabel("time [s]" if over == "seconds" else what)
-    axis.set_title(DATA[data])
-    axis.legend(fontsize="small")
-
-
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    args = common.parse(__doc__, argv, mrclam="", runs=32, heldout=64, starts=20, recovery_runs=256)
+    sizes = {"runs": 32, "heldout": 64, "starts": 20, "recovery_runs": 256}
+    sizes |= {"sequences": 16, "steps": 200, "calibration_runs": 16}
+    args = common.parse(__doc__, argv, mrclam="", **sizes)
     use_cpu_devices()
     enable_caches()
     about = {key: str(value) for key, value in vars(args).items() if key != "out"}
@@ -194,25 +183,39 @@ def main(argv: list[str] | None = None) -> int:
     rows, traces = [], {}
     for data, task in tasks.items():
         more, traces[data] = compare(data, task, args.seed, NUM_UPDATES[data], cache)
-        rows += more
+        rows += more + adapting(data, task, traces[data]["gradient"], cache)
         if data == "office":
             update = cache("a step", partial(update_seconds, task))
+    own = args.seed, args.sequences, args.steps, MODEL_UPDATES, cache
+    models = model_tuners.compute(*own)
+    calibrated = calibration_rows.compute(args.seed, args.calibration_runs, args.heldout, cache)
     found = parameter_recovery.compute(
         args.seed, args.starts, args.recovery_runs, args.heldout, cache
     )
     numbers = {"seed": args.seed, "rows": rows, "recovery": found, "step": update, "traces": traces}
+    numbers |= {"models": models, "calibration": calibrated}
     common.save(args.out, NAME, numbers, draw)
     cache.clear()
-    for row in rows:
+    print_rows(numbers)
+    return 0
+
+
+def print_rows(numbers: common.Numbers) -> None:
+    """Print a line for each row, and the summaries."""
+    for row in numbers["rows"] + numbers["calibration"]:
         error, nees = 100 * (row["heldout_rmse_m"] or np.nan), row["nees"] or np.nan
-        name = f"{row['data']:7} {row['method']:11}"
-        print(f"{name} {error:8.2f} cm  NEES per dof {nees:7.2f}  {row['seconds']:6.0f} s")
+        name = f"{row['data']:11} {row['method']:30}"
+        print(f"{name} {error:8.2f} cm  NEES per dof {nees:7.2f}  {row['seconds']:7.1f} s")
+    for name, rows in numbers["models"].items():
+        for row in rows:
+            text = f"{name:11} {row['method']:30} {row['error']:8.3f} of a logarithm  "
+            print(f"{text}loss {row['loss']:8.5f}  {row['seconds']:7.1f} s")
+    update, found = numbers["step"], numbers["recovery"]
     print(
         f"an update over {update['runs']} trials of {update['scans']} scans: "
         f"{update['seconds']:.1f} s"
     )
     print({key: found[key] for key in ("starts", "within_3_se", "worst_heldout_ratio")})
-    return 0
 
 
 if __name__ == "__main__":

@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import common, exact_model, noise_search, parameter_recovery, tuning
+from experiments import (
+    adaptation,
+    calibration_rows,
+    common,
+    exact_model,
+    model_tuners,
+    noise_search,
+    parameter_recovery,
+    tuning,
+)
 from jaxslam.core import trace_cache
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.tuning import fitting, parameters, standard_errors
@@ -16,6 +25,10 @@ from jaxslam.tuning.standard_errors import StandardErrors
 
 HAND = NoiseParams.for_landmark_sensor()
 TASK = noise_search.Task(exact_model.CONFIG, HAND, None, None, ("wall_angle_std",))
+TRUTH_ROW = {"method": "truth", "loss": -0.7, "error": 0.0, "seconds": 0.0}
+OWN_ROW = {"method": "jaxslam", "error": 0.1, "seconds": 2.0}
+CALIBRATION_ROW = {"data": "calibration", "method": "closed form", "heldout_rmse_m": 0.01}
+CALIBRATION_ROW |= {"nees": 1.2, "seconds": 0.1}
 BEST = parameters.flatten_params(HAND) + np.array([1.5, -3.0, 2.0, 1.0, -2.4, -3.0, 1.1, 0.0])
 
 
@@ -196,6 +209,11 @@ def test_each_task_is_compared_on_its_own_drives_and_all_is_written(monkeypatch,
         compared.append((data, task.train))
         return [tuning._row(data, "hand", point, 0.0, 0, trace, point)], {"gradient": trace}
 
+    def adapting(data, task, own, cache):
+        assert own == trace and task.train == ("drives" if data == "office" else "robots")
+        names = ("hand, adapting", "gradient", "gradient, adapting")
+        return [tuning._row(data, name, point, 0.0, 0, trace, point) for name in names]
+
     theta = parameters.flatten_params(exact_model.true_params())
     rows = [{"start": theta + 0.1, "theta": theta}]
     sure = {"standard_errors": [0.1] * 8, "identifiable": [True] * 7 + [False]}
@@ -210,14 +228,46 @@ def test_each_task_is_compared_on_its_own_drives_and_all_is_written(monkeypatch,
     step = {"runs": 2, "scans": 3, "seconds": 0.5}
     monkeypatch.setattr(tuning, "update_seconds", lambda task: step | {"of": task.train})
     monkeypatch.setattr(parameter_recovery, "compute", lambda *_: recovered)
+    models = {name: [TRUTH_ROW, TRUTH_ROW | OWN_ROW] for name in ("pendulum", "linear")}
+    monkeypatch.setattr(model_tuners, "compute", lambda *_: models)
+    monkeypatch.setattr(calibration_rows, "compute", lambda *_: [CALIBRATION_ROW])
+    monkeypatch.setattr(tuning, "adapting", adapting)
     monkeypatch.setattr(tuning, "enable_caches", lambda: None)
     assert tuning.main(["--out", str(tmp_path), "--mrclam", "folder"]) == 0
     assert compared == [("office", "drives"), ("mrclam", "robots")]
     numbers = json.loads((tmp_path / "tuning.json").read_text())
-    assert [row["data"] for row in numbers["rows"]] == ["office", "mrclam"]
+    assert [row["data"] for row in numbers["rows"]] == 4 * ["office"] + 4 * ["mrclam"]
+    assert numbers["models"] == models and numbers["calibration"] == [CALIBRATION_ROW]
     assert numbers["step"]["of"] == "drives" and numbers["recovery"]["within_3_se"] == 1
     assert {file.name for file in tmp_path.iterdir()} == {"tuning.json", "tuning.png"}
-    assert "NEES" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "NEES" in printed and "closed form" in printed and "jaxslam" in printed
+
+
+def test_hand_set_and_tuned_noise_adapt_with_the_parameters_that_they_have(monkeypatch, tmp_path):
+    """Noise that adapts starts from the first and the last point of the gradient."""
+    truth = parameters.flatten_params(HAND)
+    points = [{"theta": list(truth + by), "heldout_rmse_m": 0.1, "nees": 2.0} for by in (0, 1, 2)]
+    asked = []
+
+    def heldout(config, params, drives):
+        asked.append((config, parameters.flatten_params(params), drives))
+        found = {"heldout_rmse_m": 0.01 * len(asked), "nees": 1.5, "diverged": 0}
+        return found | {"q_factor": 0.5, "r_factor": 2.0}
+
+    monkeypatch.setattr(adaptation, "heldout", heldout)
+    own = {"points": points, "seconds": 5.0, "evaluations": 7}
+    cache = common.ResultCache(tmp_path / "cache", "x")
+    task = TASK._replace(test="held out")
+    rows = tuning.adapting("office", task, own, cache)
+    assert rows == tuning.adapting("office", task, own, cache) and len(asked) == 2
+    assert [row["method"] for row in rows] == ["hand, adapting", "gradient, adapting"]
+    for (config, theta, drives), by in zip(asked, (0, 2), strict=True):
+        assert config is TASK.config.filter and drives == "held out"
+        np.testing.assert_allclose(theta, truth + by, rtol=1e-6)
+    assert [row["heldout_rmse_m"] for row in rows] == [0.01, 0.02]
+    assert [row["seconds"] for row in rows] == [0.0, 5.0] and rows[1]["evaluations"] == 7
+    assert rows[0]["nees"] == 1.5 and rows[0]["q_factor"] == 0.5 and rows[0]["r_factor"] == 2.0
 
 
 def test_a_folder_without_the_data_is_reported(tmp_path, monkeypatch, capsys):

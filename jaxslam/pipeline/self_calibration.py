@@ -23,13 +23,14 @@ import numpy as np
 from jaxslam.core.calibration import Calibration, along_arc, calibrate_odometry
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.measurement import ScanMatch
-from jaxslam.core.se2_np import compose, dead_reckoning, relative
+from jaxslam.core.se2_np import compose, dead_reckoning, relative, wrap_angle
 from jaxslam.core.types import AnyArray
 from jaxslam.pipeline import breaks, keyframes, odometry_notes, online
 from jaxslam.pipeline.log_input import LogInput, OdometrySource
 from jaxslam.smoothing.odometry_calibration import (
     CalibrationEstimate,
     MotionSpans,
+    contradicted,
     estimate_calibration,
     flat,
 )
@@ -53,6 +54,12 @@ MIN_INTERVAL = 0.1
 """Interval between two scans, of the median one, below which their stamps are those of a queue."""
 
 IRLS_ITERATIONS = 30
+
+MAX_CONTRADICTED = 0.5
+"""Share of the spans over which wheels may move otherwise than the scans show, at most."""
+
+MAINLY_SIDEWAYS = 2.0
+"""Motion to the side, of that ahead, from which the frame of the odometry is a quarter turn off."""
 
 LEFT_SIDEWAYS = 0.5
 """Share of the median sideways motion that may be left in the frame between the wheels."""
@@ -95,7 +102,8 @@ def calibrate_log(
             as of `wheel_frame`.
 
     Raises:
-        ValueError: The log has no odometry, or it is not used.
+        ValueError: The log has no odometry, or it is not used; or its wheels move otherwise than
+            its scans show.
     """
     require_wheels(log, given.odometry_source)
     calibration = Calibration.identity() if mean is None else mean
@@ -112,10 +120,39 @@ def calibrate_log(
         spans = motion_spans(given, odometry, matches, guessed, times, taken)
         estimate = estimate_calibration(spans, mean, prior_std)
         calibration = estimate.calibration
-        change, before = np.abs(flat(calibration) - before), flat(calibration)
+        change, before = flat(calibration) - before, flat(calibration)
+        change[5] = wrap_angle(change[5])
+        change = np.abs(change)
         limit = CONVERGED * flat(estimate.standard_errors)
     is_settled = bool(np.all(change <= limit))
+    require_agreement(calibration, spans)
     return LogCalibration(estimate, taken, num_rounds, spans, is_settled)
+
+
+def require_agreement(calibration: Calibration, spans: MotionSpans) -> None:
+    """Raise unless calibrated wheels move as the scans show, but for some spans.
+
+    Args:
+        calibration: Of the robot.
+        spans: Of its drive.
+
+    Raises:
+        ValueError: There is no usable span, or at most of them the wheels move otherwise, or they
+            turn to the other side.
+    """
+    num_off, count = int(contradicted(calibration, spans).sum()), int(spans.usable.sum())
+    if not count:
+        raise ValueError("there is no motion to calibrate by: no two scans could be matched")
+    if num_off > MAX_CONTRADICTED * count:
+        raise ValueError(
+            f"its wheels, however calibrated, do not move as its scans show at {num_off} of "
+            f"{count} spans; check odometry and scans of the log, or leave out the calibration"
+        )
+    if calibration.turn_scale < 0.0:
+        raise ValueError(
+            f"its scans turn against its wheels, turn_scale {calibration.turn_scale:.3f}: one of "
+            "both is mirrored; see --upside-down"
+        )
 
 
 def calibrated(
@@ -188,10 +225,14 @@ def wheel_frame(odometry: np.ndarray, mount: np.ndarray, usable: np.ndarray) -> 
         mount: (3,) [m, m, rad] of the scanner in the frame of the robot whose odometry this is.
         usable: (T,) bool, which increments are not guesses.
     """
-    zero = np.zeros(3)
-    of_robot = compose(compose(mount, odometry), relative(mount, zero))[usable]
+    taken, zero = np.array(mount, np.float64), np.zeros(3)
+    of_robot = compose(compose(taken, odometry), relative(taken, zero))[usable]
     if not len(of_robot):
-        return np.array(mount, np.float64)
+        return taken
+    quarter = np.array([0.0, 0.0, _quarter_turn(of_robot)])
+    if quarter[2]:
+        taken = compose(relative(quarter, zero), taken)
+        of_robot = compose(compose(taken, odometry), relative(taken, zero))[usable]
     turn = of_robot[:, 2]
     ahead, sideways = along_arc(of_robot).T
     by, weight = np.stack([turn, -ahead], axis=1), np.ones(len(turn))
@@ -200,9 +241,23 @@ def wheel_frame(odometry: np.ndarray, mount: np.ndarray, usable: np.ndarray) -> 
         left = np.abs(sideways - by @ [lever, tan])
         weight = 1.0 / np.sqrt(1.0 + (left / max(np.median(left), 1e-6)) ** 2)
     if np.median(left) > LEFT_SIDEWAYS * np.median(np.abs(sideways)):
-        return np.array(mount, np.float64)
+        return taken
     yaw = np.arctan(tan)
-    return compose(np.array([lever * np.cos(yaw), 0.0, yaw]), np.asarray(mount, np.float64))
+    return compose(np.array([lever * np.cos(yaw), 0.0, yaw]), taken)
+
+
+def _quarter_turn(of_robot: np.ndarray) -> float:
+    """Direction [rad] in which a robot with increments (n, 3) drives, if it is to a side; else 0.
+
+    What it moves by as it turns is left out: that is of a frame off the axle.
+    """
+    turn = of_robot[:, 2:]
+    moved = along_arc(of_robot)
+    moved = moved - turn * (turn.T @ moved) / max(float(np.sum(turn**2)), 1e-12)
+    ahead, sideways = np.median(np.abs(moved), axis=0)
+    if sideways <= MAINLY_SIDEWAYS * ahead:
+        return 0.0
+    return float(np.copysign(np.pi / 2, np.sum(moved[:, 1])))
 
 
 def motion_spans(

@@ -80,6 +80,10 @@ def test_lines_name_what_is_not_determined():
     assert lines[0].split() == ["distance_scale", "1.0500", "+-", "0.0010"]
     assert lines[5].split() == ["mount[2]", "3.0000", "+-", "0.1000", "deg"]
     assert [line for line in lines if "not determined" in line] == [lines[3]]
+    assert not [line for line in lines if "far from" in line]
+    turned = robot.calibration._replace(mount=np.array([0.0, 0.0, 1.5]))
+    lines = calibrated_logs.calibration_lines(robot._replace(calibration=turned))
+    assert [line for line in lines if "far from" in line] == [lines[5]]
 
 
 @pytest.mark.slow

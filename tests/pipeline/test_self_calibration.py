@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import wheel_drives
 from office_drive import LIDAR, office_drive, take
 
 from jaxslam.core.calibration import Calibration, calibrate_odometry
@@ -35,7 +36,9 @@ def test_times_that_cannot_be_trusted():
     assert np.all(np.diff(found) > 0) and np.abs(found - np.maximum.accumulate(some)).max() < 1e-3
 
 
-@pytest.mark.parametrize("place", [[0.0, 0.0, 0.0], [-0.25, 0.0, -0.05]])
+@pytest.mark.parametrize(
+    "place", [[0.0, 0.0, 0.0], [-0.25, 0.0, -0.05], [0.1, 0.0, 1.6], [0.0, 0.0, -1.5]]
+)
 def test_the_frame_between_the_wheels_is_found(place):
     """From how the poses of a scanner move sideways, a tenth of them by anything."""
     rng = np.random.default_rng(0)
@@ -68,6 +71,27 @@ def test_scans_without_wheels_are_refused():
         self_calibration.require_wheels(log._replace(has_odometry=False))
     with pytest.raises(ValueError, match="where scans alone are matched"):
         self_calibration.require_wheels(log, "scans-only")
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"usable": np.zeros(39, bool)}, "no motion to calibrate by: no two scans"),
+        ({"increment": np.tile([0.0, 0.4, 0.3], (39, 1))}, "as its scans show at 39 of 39 spans"),
+    ],
+)
+def test_wheels_that_say_nothing_of_the_motion_are_refused(wrong, message):
+    spans = wheel_drives.drive(np.random.default_rng(0), 40)
+    self_calibration.require_agreement(wheel_drives.TRUE, spans)
+    with pytest.raises(ValueError, match=message):
+        self_calibration.require_agreement(wheel_drives.TRUE, spans._replace(**wrong))
+
+
+def test_a_mirrored_scanner_is_named():
+    mirrored = wheel_drives.TRUE._replace(turn_scale=np.asarray(-1.0))
+    spans = wheel_drives.drive(np.random.default_rng(0), 40, true=mirrored)
+    with pytest.raises(ValueError, match=r"turn against its wheels, .* see --upside-down"):
+        self_calibration.require_agreement(mirrored, spans)
 
 
 @pytest.fixture(scope="module")

@@ -69,7 +69,7 @@ def check_calibration(
         known: The calibration of the file.
     """
     if file is not None and known is not None:
-        calibration_file.check_robot(file, known, log)
+        calibration_file.check_robot(file, known, log, str(path))
     with name_errors(str(path)):
         self_calibration.require_wheels(log, given.odometry_source)
 
@@ -143,8 +143,13 @@ def find_calibration(
     print_calibration(robot, f"calibration of {path}, by {counts}:")
     if not found.is_settled:
         print("note: the calibration still changed when the scans were matched last")
-    _print_contradictions(path, found.estimate.calibration, found.spans)
-    about = {"spans": num_spans, "rounds": found.num_rounds, "settled": found.is_settled}
+    print_contradictions(path, found.estimate.calibration, found.spans)
+    about = {
+        "spans": num_spans,
+        "contradicted_spans": int(contradicted(found.estimate.calibration, found.spans).sum()),
+        "rounds": found.num_rounds,
+        "settled": found.is_settled,
+    }
     return robot, about
 
 
@@ -175,10 +180,12 @@ def tune_calibration(
     robot = _robot_of(logs[0], tuned, first.mount)
     print_calibration(robot, f"calibration of the robot, by {tuned.num_spans} spans:")
     for path, one in zip(paths, found, strict=False):
-        _print_contradictions(path, tuned.calibration, one.spans)
+        print_contradictions(path, tuned.calibration, one.spans)
     moved = []
     for path, log, given in zip(paths, logs, inputs, strict=True):
         own, calibrated_input = use_calibration(path, log, given, robot)
+        for note in calibrated_input.notes[len(given.notes) :]:
+            print(f"{path}: note: {note}", flush=True)
         moved.append(own._replace(odometry_guessed=calibrated_input.guessed))
     return robot, moved
 
@@ -197,8 +204,13 @@ def check_same_robot(paths: Sequence[Path], logs: Sequence[LaserLog]) -> None:
         logs[0].frames,
         logs[0].lidar,
     )
-    for log in logs[1:]:
-        calibration_file.check_robot(paths[0], first, log)
+    for path, log in zip(paths[1:], logs[1:], strict=True):
+        try:
+            calibration_file.check_robot(paths[0], first, log, str(path))
+        except InputError as error:
+            problem = str(error).partition(";")[0]
+            advice = "only logs of one robot are calibrated together"
+            raise InputError(problem, field="--calibrate", advice=advice) from None
 
 
 def _robot_of(log: LaserLog, found: CalibrationEstimate, wheels: np.ndarray) -> RobotCalibration:
@@ -221,8 +233,14 @@ def print_calibration(robot: RobotCalibration, title: str) -> None:
         print(f"  {line}")
 
 
-def _print_contradictions(path: Path, calibration: Calibration, spans: MotionSpans) -> None:
-    """Print where calibrated wheels move otherwise than the scans show, if that is often."""
+def print_contradictions(path: Path, calibration: Calibration, spans: MotionSpans) -> None:
+    """Print where calibrated wheels move otherwise than the scans show, if that is often.
+
+    Args:
+        path: The log.
+        calibration: Of its robot.
+        spans: Of its drive.
+    """
     num_off, count = int(contradicted(calibration, spans).sum()), int(spans.usable.sum())
     if num_off > NOTED_CONTRADICTIONS * count:
         print(
@@ -243,9 +261,10 @@ def use_calibration(
     )
     mount = compose(np.asarray(log.mount, float), np.asarray(robot.calibration.mount))
     texts = [" ".join(f"{number:.4f}" for number in pose) for pose in (robot.mount, mount)]
+    unsure = f"; not determined: {', '.join(robot.not_determined)}" if robot.not_determined else ""
     print(
         f"odometry of {path} is calibrated, on top of the scanner's mount {texts[0]}, which "
-        f"becomes {texts[1]}",
+        f"becomes {texts[1]}{unsure}",
         flush=True,
     )
     log = log._replace(

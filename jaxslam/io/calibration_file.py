@@ -147,13 +147,16 @@ def require_possible(path: str | PathLike, calibration: Calibration) -> None:
             raise InputError(problem, path=path, field=name, advice=advice)
 
 
-def check_robot(path: str | PathLike, found: RobotCalibration, log: LaserLog) -> None:
+def check_robot(
+    path: str | PathLike, found: RobotCalibration, log: LaserLog, name: str = "the log"
+) -> None:
     """Raise unless a calibration may be that of the robot of a log.
 
     Args:
         path: The file of the calibration, for the message.
         found: The calibration.
         log: The log.
+        name: Of the log, for the message.
 
     Raises:
         InputError: The log is of another scanner, has other frames, or had its scanner at another
@@ -161,7 +164,7 @@ def check_robot(path: str | PathLike, found: RobotCalibration, log: LaserLog) ->
     """
 
     def refuse(field: str, own: str, other: str, advice: str) -> InputError:
-        problem = f"is of another robot: {own}, and the log has {other}"
+        problem = f"is of another robot: {own}, and {name} has {other}"
         return InputError(problem, path=path, field=field, advice=advice)
 
     again = "calibrate this robot by --calibrate"
@@ -175,11 +178,11 @@ def check_robot(path: str | PathLike, found: RobotCalibration, log: LaserLog) ->
             beam_is = "the last beam" if beam else "the first beam"
             texts = [f"{np.degrees(angle):.2f} degrees" for angle in angles]
             raise refuse(f"robot.{field}", f"{beam_is} at {texts[0]}", texts[1], again)
-    for field, name, frame in zip(
+    for field, known, frame in zip(
         ("base_frame", "scan_frame"), found.frames, log.frames, strict=True
     ):
-        if name and frame and name != frame:
-            raise refuse(f"robot.{field}", f"frame {name!r}", repr(frame), again)
+        if known and frame and known != frame:
+            raise refuse(f"robot.{field}", f"frame {known!r}", repr(frame), again)
     off = relative(np.asarray(found.mount, float), np.asarray(log.mount, float))
     if np.abs(off).max() > SAME_MOUNT:
         texts = [np.array2string(np.asarray(x), precision=4) for x in (found.mount, log.mount)]

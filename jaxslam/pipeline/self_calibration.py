@@ -171,9 +171,10 @@ def calibrated(
     """
     require_wheels(log, given.odometry_source)
     odometry, is_share, notes = _shared(given)
-    moved = calibrate_odometry(
-        calibration, odometry, times=usable_times(log.times), mount=np.asarray(mount)
-    )
+    times = usable_times(log.times)
+    if times is None and calibration.time_offset:
+        notes += ("the calibration's time offset is not used: time stamps cannot be trusted",)
+    moved = calibrate_odometry(calibration, odometry, times=times, mount=np.asarray(mount))
     return given._replace(
         odom_poses=dead_reckoning(np.zeros(3), moved),
         increments=moved,

@@ -94,6 +94,20 @@ def test_a_mirrored_scanner_is_named():
         self_calibration.require_agreement(mirrored, spans)
 
 
+@pytest.mark.parametrize("step, noted", [(0.0, True), (0.5, False)])
+def test_a_time_offset_that_cannot_be_used_is_noted(step, noted):
+    poses = np.outer(np.arange(4), [0.3, 0.0, 0.1])
+    ranges = np.full((4, LIDAR.num_beams), 3.0)
+    log = LaserLog.from_arrays(step * np.arange(4), poses, ranges, LIDAR)
+    given = log_input.from_laser_log(log)
+    offset = Calibration.identity()._replace(time_offset=np.asarray(0.1))
+    moved = self_calibration.calibrated(log, given, offset, NO_TIME)
+    assert any("time offset is not used" in note for note in moved.notes) == noted
+    assert np.array_equal(moved.increments.round(9), given.increments.round(9)) == noted
+    none = self_calibration.calibrated(log, given, Calibration.identity(), NO_TIME)
+    assert none.notes == given.notes
+
+
 @pytest.fixture(scope="module")
 def office_log():
     """A drive through the office by wheels that are off; and the true poses of its scanner."""

@@ -15,11 +15,13 @@ from jaxslam.evaluation import log_errors
 from jaxslam.io import calibration_file
 from jaxslam.io.calibration_file import RobotCalibration
 from jaxslam.io.errors import InputError
-from jaxslam.pipeline import log_input, self_calibration
+from jaxslam.pipeline import log_input, motion_spans, self_calibration
 from jaxslam.pipeline.log_input import LogInput
 from jaxslam.smoothing.odometry_calibration import (
     NAMES,
     CalibrationEstimate,
+    MotionSpans,
+    contradicted,
     default_prior_std,
     flat,
     unflat,
@@ -29,6 +31,12 @@ from jaxslam.tuning import calibration_model
 CHANGED_SINCE = 0.1
 """Standard deviation, of that of a robot never calibrated, by which a calibration may have changed
 since it was written."""
+
+FAR_OFF = 3.0
+"""Such standard deviations by which a number is far from that of usual robots."""
+
+NOTED_CONTRADICTIONS = 0.2
+"""Share of the spans, from which it is noted that calibrated wheels move otherwise than scans."""
 
 UNITS = ("", "", "rad/m", "m", "m", "deg", "s")
 """Of the numbers of a calibration, as they are printed."""
@@ -61,7 +69,7 @@ def check_calibration(
         known: The calibration of the file.
     """
     if file is not None and known is not None:
-        calibration_file.check_robot(file, known, log)
+        calibration_file.check_robot(file, known, log, str(path))
     with name_errors(str(path)):
         self_calibration.require_wheels(log, given.odometry_source)
 
@@ -128,13 +136,20 @@ def find_calibration(
     print(f"{path}: calibrating its wheels by its scans ...", flush=True)
     with name_errors(str(path)):
         found = self_calibration.calibrate_log(log, given, mean, prior_std, mount=mount)
+    calibration_file.require_possible(path, found.estimate.calibration)
     robot = _robot_of(log, found.estimate, found.mount)
     num_spans = found.estimate.num_spans
     counts = f"{num_spans} spans, scans matched {found.num_rounds} times"
     print_calibration(robot, f"calibration of {path}, by {counts}:")
     if not found.is_settled:
         print("note: the calibration still changed when the scans were matched last")
-    about = {"spans": num_spans, "rounds": found.num_rounds, "settled": found.is_settled}
+    print_contradictions(path, found.estimate.calibration, found.spans)
+    about = {
+        "spans": num_spans,
+        "contradicted_spans": int(contradicted(found.estimate.calibration, found.spans).sum()),
+        "rounds": found.num_rounds,
+        "settled": found.is_settled,
+    }
     return robot, about
 
 
@@ -158,11 +173,19 @@ def tune_calibration(
     first = max(found, key=lambda one: one.estimate.num_spans)
     with name_errors(str(paths[0])):
         tuned = calibration_model.tune_calibration([x.spans for x in found], first.estimate)
+    for path, one in zip(paths, found, strict=False):
+        with name_errors(str(path)):
+            self_calibration.require_agreement(tuned.calibration, one.spans)
+    calibration_file.require_possible(paths[0], tuned.calibration)
     robot = _robot_of(logs[0], tuned, first.mount)
     print_calibration(robot, f"calibration of the robot, by {tuned.num_spans} spans:")
+    for path, one in zip(paths, found, strict=False):
+        print_contradictions(path, tuned.calibration, one.spans)
     moved = []
     for path, log, given in zip(paths, logs, inputs, strict=True):
         own, calibrated_input = use_calibration(path, log, given, robot)
+        for note in calibrated_input.notes[len(given.notes) :]:
+            print(f"{path}: note: {note}", flush=True)
         moved.append(own._replace(odometry_guessed=calibrated_input.guessed))
     return robot, moved
 
@@ -181,8 +204,13 @@ def check_same_robot(paths: Sequence[Path], logs: Sequence[LaserLog]) -> None:
         logs[0].frames,
         logs[0].lidar,
     )
-    for log in logs[1:]:
-        calibration_file.check_robot(paths[0], first, log)
+    for path, log in zip(paths[1:], logs[1:], strict=True):
+        try:
+            calibration_file.check_robot(paths[0], first, log, str(path))
+        except InputError as error:
+            problem = str(error).partition(";")[0]
+            advice = "only logs of one robot are calibrated together"
+            raise InputError(problem, field="--calibrate", advice=advice) from None
 
 
 def _robot_of(log: LaserLog, found: CalibrationEstimate, wheels: np.ndarray) -> RobotCalibration:
@@ -205,11 +233,27 @@ def print_calibration(robot: RobotCalibration, title: str) -> None:
         print(f"  {line}")
 
 
+def print_contradictions(path: Path, calibration: Calibration, spans: MotionSpans) -> None:
+    """Print where calibrated wheels move otherwise than the scans show, if that is often.
+
+    Args:
+        path: The log.
+        calibration: Of its robot.
+        spans: Of its drive.
+    """
+    num_off, count = int(contradicted(calibration, spans).sum()), int(spans.usable.sum())
+    if num_off > NOTED_CONTRADICTIONS * count:
+        print(
+            f"WARNING: {path}: calibrated wheels do not move as the scans show at {num_off} of "
+            f"{count} spans, so the calibration may be off by more than its standard errors"
+        )
+
+
 def use_calibration(
     path: Path, log: LaserLog, given: LogInput, robot: RobotCalibration
 ) -> tuple[LaserLog, LogInput]:
     """The log and its input of SLAM with calibrated odometry and mount; prints that they are."""
-    times = self_calibration.usable_times(log.odom_stream_times)
+    times = motion_spans.usable_times(log.odom_stream_times)
     with name_errors(str(path)):
         moved = self_calibration.calibrated(log, given, robot.calibration, robot.wheels)
     stream = calibrate_odometry(
@@ -217,9 +261,10 @@ def use_calibration(
     )
     mount = compose(np.asarray(log.mount, float), np.asarray(robot.calibration.mount))
     texts = [" ".join(f"{number:.4f}" for number in pose) for pose in (robot.mount, mount)]
+    unsure = f"; not determined: {', '.join(robot.not_determined)}" if robot.not_determined else ""
     print(
         f"odometry of {path} is calibrated, on top of the scanner's mount {texts[0]}, which "
-        f"becomes {texts[1]}",
+        f"becomes {texts[1]}{unsure}",
         flush=True,
     )
     log = log._replace(
@@ -237,6 +282,8 @@ def calibration_lines(robot: RobotCalibration) -> list[str]:
         robot: The calibration.
     """
     numbers, errors = flat(robot.calibration), flat(robot.standard_errors)
+    off = np.abs(numbers - flat(Calibration.identity())) / flat(default_prior_std())
+    far = dict(zip(NAMES, off > FAR_OFF, strict=True))
     lines = []
     for name, number, error, unit in zip(NAMES, numbers, errors, UNITS, strict=True):
         if unit == "deg":
@@ -244,6 +291,8 @@ def calibration_lines(robot: RobotCalibration) -> list[str]:
         text = f"{name:20}{number:10.4f} +- {error:.4f} {unit}".rstrip()
         if name in robot.not_determined:
             text += "   not determined by this drive"
+        if far[name]:
+            text += "   far from that of usual robots: check it"
         lines.append(text)
     return lines
 

@@ -216,7 +216,9 @@ def run(
             extra["calibration"] = calibrations if len(drives) > 1 else calibrations[0]
         if folders:
             extra["other_parts"] = folders
-        extra["mended"] += _left_from_before(out, folders, len(drives))
+        kept = {path.name for path in out_dir.glob("calibration*.json")}
+        kept |= {path.name for path in calibration if path.resolve().parent == out.resolve()}
+        extra["mended"] += left_from_before(out, [*folders, *kept], len(drives))
         numbers, num_warnings = run_results.write(context, result, out_dir, extra)
         for name, part in zip(folders, result.other_parts, strict=True):
             (out_dir / name).mkdir()
@@ -243,13 +245,20 @@ def _read_map(folder_of_map: Path) -> tuple[SavedMap, AnnotatedMap | None]:
     return saved, annotated
 
 
-def _left_from_before(out: Path, folders: Sequence[str], num_logs: int) -> list[str]:
-    """A note on results of an earlier run that this one does not replace."""
+def left_from_before(out: Path, kept: Sequence[str], num_logs: int) -> list[str]:
+    """A note on results of an earlier run that this one does not replace.
+
+    Args:
+        out: Folder of the results.
+        kept: Names of files and folders that are this run's.
+        num_logs: Number of logs.
+    """
     own = (
         {f"trajectory.{k + 1}.tum" for k in range(num_logs)} if num_logs > 1 else {"trajectory.tum"}
     )
-    found = {path.name for pattern in ("part_*", "trajectory*.tum") for path in out.glob(pattern)}
-    left = sorted(found - own - set(folders))
+    patterns = "part_*", "trajectory*.tum", "calibration*.json"
+    found = {path.name for pattern in patterns for path in out.glob(pattern)}
+    left = sorted(found - own - set(kept))
     return [f"{out}: {', '.join(left)} of an earlier run stay there"] if left else []
 
 

@@ -163,6 +163,9 @@ def tune(
         task = simulated_task(world, trials, heldout, noise, seed)
     with name_errors("--freeze"):  # again, of the parameters that this task has
         parameters.trainable_mask(task.params, freeze)
+    if not calibrate and (out / CALIBRATION_FILE).exists():
+        stays = f"{out / CALIBRATION_FILE} of an earlier tuning stays there"
+        print(f"note: {stays}; this noise is not that of the calibrated robot", flush=True)
     with folder(out) as out_dir:
         enable_caches()
         with stopwatch() as seconds:

@@ -25,6 +25,7 @@ from jaxslam.core.se2_np import relative
 from jaxslam.io import strict_json
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import write_json
+from jaxslam.smoothing.odometry_calibration import NAMES
 
 FORMAT, VERSION = "jaxslam-calibration", 1
 
@@ -120,19 +121,42 @@ def read(path: str | PathLike) -> RobotCalibration:
         raise InputError("there is no such file", path=path, advice=ADVICE)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"is no {FORMAT} file", path=path, field="format", advice=ADVICE)
-    if content.get("version") != VERSION:
+    if content.get("version") != VERSION or isinstance(content["version"], bool):
         problem = f"{content.get('version')!r} instead of {VERSION}"
         raise InputError(problem, path=path, field="version", advice=ADVICE)
     return _parse(path, content)
 
 
-def check_robot(path: str | PathLike, found: RobotCalibration, log: LaserLog) -> None:
+def require_possible(path: str | PathLike, calibration: Calibration) -> None:
+    """Raise unless the numbers of a calibration are those that a file may hold.
+
+    Args:
+        path: The log that it was found from, for the message.
+        calibration: The calibration.
+
+    Raises:
+        InputError: A number is out of its limits.
+    """
+    advice = "no robot is off by that: check the units of the log, its topics, and --mount"
+    for name, value in calibration._asdict().items():
+        low, high = LIMITS[name]
+        numbers = np.asarray(value, float)
+        if not ((numbers >= low) & (numbers <= high)).all():
+            problem = f"the calibration is found to be {np.round(numbers, 4).tolist()}, which is "
+            problem += f"not between {low:g} and {high:g}"
+            raise InputError(problem, path=path, field=name, advice=advice)
+
+
+def check_robot(
+    path: str | PathLike, found: RobotCalibration, log: LaserLog, name: str = "the log"
+) -> None:
     """Raise unless a calibration may be that of the robot of a log.
 
     Args:
         path: The file of the calibration, for the message.
         found: The calibration.
         log: The log.
+        name: Of the log, for the message.
 
     Raises:
         InputError: The log is of another scanner, has other frames, or had its scanner at another
@@ -140,7 +164,7 @@ def check_robot(path: str | PathLike, found: RobotCalibration, log: LaserLog) ->
     """
 
     def refuse(field: str, own: str, other: str, advice: str) -> InputError:
-        problem = f"is of another robot: {own}, and the log has {other}"
+        problem = f"is of another robot: {own}, and {name} has {other}"
         return InputError(problem, path=path, field=field, advice=advice)
 
     again = "calibrate this robot by --calibrate"
@@ -154,11 +178,11 @@ def check_robot(path: str | PathLike, found: RobotCalibration, log: LaserLog) ->
             beam_is = "the last beam" if beam else "the first beam"
             texts = [f"{np.degrees(angle):.2f} degrees" for angle in angles]
             raise refuse(f"robot.{field}", f"{beam_is} at {texts[0]}", texts[1], again)
-    for field, name, frame in zip(
+    for field, known, frame in zip(
         ("base_frame", "scan_frame"), found.frames, log.frames, strict=True
     ):
-        if name and frame and name != frame:
-            raise refuse(f"robot.{field}", f"frame {name!r}", repr(frame), again)
+        if known and frame and known != frame:
+            raise refuse(f"robot.{field}", f"frame {known!r}", repr(frame), again)
     off = relative(np.asarray(found.mount, float), np.asarray(log.mount, float))
     if np.abs(off).max() > SAME_MOUNT:
         texts = [np.array2string(np.asarray(x), precision=4) for x in (found.mount, log.mount)]
@@ -175,6 +199,10 @@ def _parse(path: str | PathLike, content: dict[str, Any]) -> RobotCalibration:
     errors = _calibration(path, "standard_errors", content["standard_errors"], positive)
     names, robot = content["not_determined"], content["robot"]
     _check_texts(path, "not_determined", names if isinstance(names, list) else [None])
+    for name in names:
+        if name not in NAMES:
+            advice = f"the names are {', '.join(NAMES)}"
+            raise InputError(f"{name[:40]!r}", path=path, field="not_determined", advice=advice)
     scanner = "num_beams", "angle_min", "angle_increment", "range_max"
     _check_keys(path, "robot", robot, ("mount", "wheels", "base_frame", "scan_frame", *scanner))
     frames = robot["base_frame"], robot["scan_frame"]
@@ -234,7 +262,8 @@ def _numbers(
         array = np.array(given)
     except ValueError:  # ragged
         array = np.array(None)
-    if array.dtype.kind not in "fiu" or array.shape != shape:
+    has_bool = isinstance(given, list) and any(isinstance(x, bool) for x in given)
+    if array.dtype.kind not in "fiu" or array.shape != shape or has_bool:
         raise InputError(f"is not {form}", path=path, field=field, advice=ADVICE)
     numbers = array.astype(np.float64)
     low, high = limits

@@ -14,8 +14,8 @@ calibration stays the same:
 Then SLAM is run with calibrated odometry. Which systematic error turns a robot about which point
 depends on where its wheels are. A robot on two wheels does not move sideways in the frame between
 them: the poses of a log are those of that frame if they do not, and else it is found from how they
-do (`wheel_frame`). How far apart they are, no log says; what is found is of the point of their axle
-that a turn does not move ahead, between wheels of equal size the middle
+do (`motion_spans.wheel_frame`). How far apart they are, no log says; what is found is of the point
+of their axle that a turn does not move ahead, between wheels of equal size the middle
 (`Calibration.without_base`).
 """
 
@@ -23,16 +23,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam.core.calibration import Calibration, along_arc, calibrate_odometry
+from jaxslam.core.calibration import Calibration, calibrate_odometry
 from jaxslam.core.logs import LaserLog
-from jaxslam.core.measurement import ScanMatch
-from jaxslam.core.se2_np import compose, dead_reckoning, relative
+from jaxslam.core.se2_np import dead_reckoning, wrap_angle
 from jaxslam.core.types import AnyArray
-from jaxslam.pipeline import breaks, keyframes, odometry_notes, online
+from jaxslam.pipeline import motion_spans, odometry_notes, online
 from jaxslam.pipeline.log_input import LogInput, OdometrySource
 from jaxslam.smoothing.odometry_calibration import (
     CalibrationEstimate,
     MotionSpans,
+    contradicted,
     estimate_calibration,
     flat,
     unflat,
@@ -47,22 +47,8 @@ CONVERGED = 0.2
 LEAST_GONE = 0.2
 """Share of its error that a round is taken to remove from a number, at least."""
 
-MATCH_STD_SCALE = 0.3
-"""Factor on the standard deviation that scan matching states, as of `NoiseParams`."""
-
-MAX_TIMES_BACK = 0.01
-"""Fraction of the time stamps that may run backwards, for the others to be trusted."""
-
-LEAST_INTERVAL = 1e-6
-"""[s] between two scans."""
-
-MIN_INTERVAL = 0.1
-"""Interval between two scans, of the median one, below which their stamps are those of a queue."""
-
-IRLS_ITERATIONS = 30
-
-LEFT_SIDEWAYS = 0.5
-"""Share of the median sideways motion that may be left in the frame between the wheels."""
+MAX_CONTRADICTED = 0.5
+"""Share of the spans over which wheels may move otherwise than the scans show, at most."""
 
 
 class LogCalibration(NamedTuple):
@@ -99,30 +85,40 @@ def calibrate_log(
         mean: As of `estimate_calibration`; the calibration that the first matching begins with.
         prior_std: As of `estimate_calibration`.
         mount: (3,) where the scanner was taken to be, in the frame between the wheels; by default
-            as of `wheel_frame`.
+            as of `motion_spans.wheel_frame`.
 
     Raises:
-        ValueError: The log has no odometry, or it is not used.
+        ValueError: The log has no odometry, or it is not used; or its wheels move otherwise than
+            its scans show.
     """
     require_wheels(log, given.odometry_source)
     calibration = Calibration.identity() if mean is None else mean
     odometry, is_share, _ = _shared(given)
     guessed = _guessed(given) | is_share
-    taken = wheel_frame(odometry, log.mount, ~guessed) if mount is None else np.asarray(mount)
-    times, start = usable_times(log.times), flat(calibration)
+    taken = (
+        motion_spans.wheel_frame(odometry, log.mount, ~guessed)
+        if mount is None
+        else np.asarray(mount)
+    )
+    times, start = motion_spans.usable_times(log.times), flat(calibration)
     rounds: list[tuple[np.ndarray, np.ndarray]] = []
     is_settled = False
     while len(rounds) < MAX_ROUNDS and not is_settled:
         calibration = unflat(start)
         moved = calibrate_odometry(calibration, odometry, times=times, mount=taken)
         matches = online.match_log(given.config, moved, given.scans, odometry_guessed=guessed)
-        spans = motion_spans(given, odometry, matches, guessed, times, taken)
+        spans = motion_spans.spans_between_keyframes(
+            given, odometry, matches, guessed, times, taken
+        )
         estimate = estimate_calibration(spans, mean, prior_std)
-        rounds.append((start, flat(estimate.calibration) - start))
+        change = flat(estimate.calibration) - start
+        change[5] = wrap_angle(change[5])
+        rounds.append((start, change))
         left = left_over(rounds)
         limit = CONVERGED * flat(estimate.standard_errors)
-        is_settled = bool(np.all(np.abs(rounds[-1][1]) <= limit) and np.all(np.abs(left) <= limit))
+        is_settled = bool(np.all(np.maximum(np.abs(change), np.abs(left)) <= limit))
         start = flat(estimate.calibration) + left
+    require_agreement(estimate.calibration, spans)
     return LogCalibration(estimate, taken, len(rounds), spans, is_settled)
 
 
@@ -144,6 +140,32 @@ def left_over(rounds: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     return f1 * (1.0 - gone) / gone
 
 
+def require_agreement(calibration: Calibration, spans: MotionSpans) -> None:
+    """Raise unless calibrated wheels move as the scans show, but for some spans.
+
+    Args:
+        calibration: Of the robot.
+        spans: Of its drive.
+
+    Raises:
+        ValueError: There is no usable span, or at most of them the wheels move otherwise, or they
+            turn to the other side.
+    """
+    num_off, count = int(contradicted(calibration, spans).sum()), int(spans.usable.sum())
+    if not count:
+        raise ValueError("there is no motion to calibrate by: no two scans could be matched")
+    if num_off > MAX_CONTRADICTED * count:
+        raise ValueError(
+            f"its wheels, however calibrated, do not move as its scans show at {num_off} of "
+            f"{count} spans; check odometry and scans of the log, or leave out the calibration"
+        )
+    if calibration.turn_scale < 0.0:
+        raise ValueError(
+            f"its scans turn against its wheels, turn_scale {calibration.turn_scale:.3f}: one of "
+            "both is mirrored; see --upside-down"
+        )
+
+
 def calibrated(
     log: LaserLog, given: LogInput, calibration: Calibration, mount: AnyArray
 ) -> LogInput:
@@ -160,9 +182,10 @@ def calibrated(
     """
     require_wheels(log, given.odometry_source)
     odometry, is_share, notes = _shared(given)
-    moved = calibrate_odometry(
-        calibration, odometry, times=usable_times(log.times), mount=np.asarray(mount)
-    )
+    times = motion_spans.usable_times(log.times)
+    if times is None and calibration.time_offset:
+        notes += ("the calibration's time offset is not used: time stamps cannot be trusted",)
+    moved = calibrate_odometry(calibration, odometry, times=times, mount=np.asarray(mount))
     return given._replace(
         odom_poses=dead_reckoning(np.zeros(3), moved),
         increments=moved,
@@ -185,110 +208,6 @@ def require_wheels(log: LaserLog, source: OdometrySource = "scan") -> None:
         raise ValueError("there is no odometry to calibrate: the log has none that can be used")
     if source == "scans-only":
         raise ValueError("there is no odometry to calibrate where scans alone are matched")
-
-
-def usable_times(times: np.ndarray) -> np.ndarray | None:
-    """Time stamps (T,) [s] since the first one, increasing; None where they cannot be trusted.
-
-    A stamp that runs backwards, or is as the one before, becomes one just after it.
-    """
-    times = np.asarray(times, np.float64)
-    if len(times) < 2 or np.mean(np.diff(times) < 0.0) > MAX_TIMES_BACK or not np.ptp(times):
-        return None
-    return np.maximum.accumulate(times - times[0]) + LEAST_INTERVAL * np.arange(len(times))
-
-
-def wheel_frame(odometry: np.ndarray, mount: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Pose (3,) of the scanner in the frame between the wheels, by how its odometry moves.
-
-    A frame at (a, 0, b) in that between two wheels, which moves by d ahead and turns by t, moves
-    sideways by
-
-        s = (a / cos b) t - tan(b) d
-
-    as its poses do that are not those of the wheels. Where this is not how they move sideways, as
-    of a robot that can drive to all sides, the poses are taken to be those of the wheels.
-
-    Args:
-        odometry: (T, 3) [m, m, rad] increments of the scanner.
-        mount: (3,) [m, m, rad] of the scanner in the frame of the robot whose odometry this is.
-        usable: (T,) bool, which increments are not guesses.
-    """
-    zero = np.zeros(3)
-    of_robot = compose(compose(mount, odometry), relative(mount, zero))[usable]
-    if not len(of_robot):
-        return np.array(mount, np.float64)
-    turn = of_robot[:, 2]
-    ahead, sideways = along_arc(of_robot).T
-    by, weight = np.stack([turn, -ahead], axis=1), np.ones(len(turn))
-    for _ in range(IRLS_ITERATIONS):  # with the Cauchy kernel
-        (lever, tan), *_ = np.linalg.lstsq(by * weight[:, None], weight * sideways, rcond=None)
-        left = np.abs(sideways - by @ [lever, tan])
-        weight = 1.0 / np.sqrt(1.0 + (left / max(np.median(left), 1e-6)) ** 2)
-    if np.median(left) > LEFT_SIDEWAYS * np.median(np.abs(sideways)):
-        return np.array(mount, np.float64)
-    yaw = np.arctan(tan)
-    return compose(np.array([lever * np.cos(yaw), 0.0, yaw]), np.asarray(mount, np.float64))
-
-
-def motion_spans(
-    given: LogInput,
-    odometry: np.ndarray,
-    matches: ScanMatch,
-    guessed: np.ndarray,
-    times: np.ndarray | None,
-    mount: np.ndarray,
-) -> MotionSpans:
-    """The spans of a drive between keyframes.
-
-    Args:
-        given: Input of SLAM.
-        odometry: (T, 3) [m, m, rad] increments that are not calibrated.
-        matches: [T] of scan matching.
-        guessed: (T,) bool, which increments of the odometry are guesses.
-        times: (T,) [s] as of `usable_times`.
-        mount: (3,) as of `LogCalibration`.
-    """
-    found = np.asarray(matches.increment, np.float64)
-    distance = keyframes.distance_for_log(given.config.keyframe_distance, found)
-    is_keyframe, _ = keyframes.choose_keyframes(distance, found)
-    is_keyframe[-1] = True
-    ends = np.flatnonzero(is_keyframe)
-    motion = keyframes.compose_matches(matches, is_keyframe)
-    inliers = np.asarray(matches.inlier_fraction)
-    bad = guessed | given.after_pause | given.new_drive | (inliers < breaks.PAUSE_INLIERS)
-    bad |= ~np.asarray(matches.information).any(axis=(1, 2)) | _in_queue(times, len(found))
-    num_bad = np.cumsum(bad)
-    reported = dead_reckoning(np.zeros(3), odometry)
-    first, last = ends[:-1], ends[1:]
-    gone = relative(reported[first], reported[last])
-    information = np.asarray(motion.information, np.float64)[1:] / MATCH_STD_SCALE**2
-    return MotionSpans(
-        times=times,
-        odometry=odometry,
-        mount=mount,
-        first=first.astype(np.int32),
-        last=last.astype(np.int32),
-        increment=np.asarray(motion.increment, np.float64)[1:],
-        match_cov=np.linalg.inv(information + keyframes.NO_INFORMATION * np.eye(3)),
-        driven=np.stack([np.hypot(gone[:, 0], gone[:, 1]), np.abs(gone[:, 2])], axis=1),
-        usable=num_bad[last] == num_bad[first],
-    )
-
-
-def _in_queue(times: np.ndarray | None, count: int) -> np.ndarray:
-    """Whether each of `count` scans was stamped at once with another, and not when it was taken.
-
-    By such a stamp, the robot would have driven a whole increment in no time.
-    """
-    queued = np.zeros(count, bool)
-    if times is None:
-        return queued
-    interval = np.diff(times)
-    short = np.flatnonzero(interval < MIN_INTERVAL * np.median(interval))
-    for k in (0, 1, 2):  # the increments before, between both, and after
-        queued[np.minimum(short + k, count - 1)] = True
-    return queued
 
 
 def _guessed(given: LogInput) -> np.ndarray:

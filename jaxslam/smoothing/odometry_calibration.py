@@ -16,24 +16,31 @@ probability of both is found in turns:
         noise = argmax of the posterior, by L-BFGS
         c    += Gauss-Newton step, each span weighted by (nu + 3) / (nu + e^T C^-1 e)
 
+Clocks that are off by more than the robot takes for a turn are not found by small steps. So the
+mean of the prior, and the best of a grid of time offsets, are both climbed from, and the higher
+maximum is taken.
+
 References:
     Censi, Franchi, Marchionni, Oriolo (2013), Simultaneous calibration of odometry and sensor
     parameters for mobile robots. Lange, Little, Taylor (1989), Robust statistical modeling using
     the t distribution. White (1982), Maximum likelihood estimation of misspecified models.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import gammaln
 
 from jaxslam.core import se2, se2_np
 from jaxslam.core.calibration import Calibration, calibrate_odometry, reckon
 from jaxslam.matching.odometry_fusion import DEGREES_OF_FREEDOM
-
-NOISE_LOG_STD = 1.0
-"""Standard deviation of the logarithm of each number of the noise, before any drive."""
+from jaxslam.smoothing.calibration_noise import (
+    CalibrationNoise,
+    fit_noise,
+    log_density,
+    log_prior,
+    whitened_errors,
+)
 
 NUM_PIECES = 32
 """Of the drive, whose gradients vary as its information says, if the model is right."""
@@ -48,23 +55,11 @@ CONVERGED = 1e-3
 DERIVATIVE_STEP = 1e-4
 """Standard deviations of the prior by which a number is changed for its derivative."""
 
+CLOCKS_APART, CLOCK_STEP = 6.0, 0.25
+"""[s] by which clocks may be off to be found, and between two that are tried."""
 
-class CalibrationNoise(NamedTuple):
-    """What is left of the difference of wheels and scans; standard deviations.
-
-    Attributes:
-        coefficients: (4,) a0 [m / sqrt(m)], a1 [m / sqrt(rad)], a2 [rad / sqrt(m)], a3
-            [rad / sqrt(rad)].
-        floor: (2,) b0 [m], b1 [rad].
-    """
-
-    coefficients: Any
-    floor: Any
-
-    @classmethod
-    def typical(cls) -> "CalibrationNoise":
-        """That of robots of the usual kind, to start from."""
-        return cls(np.array([0.03, 0.03, 0.03, 0.03]), np.array([0.02, 0.01]))
+LEFT_SHARE, LEFT_OVER = 0.3, 0.05
+"""Share of a motion, and [m] or [rad], up to which wheels and scans say the same."""
 
 
 class MotionSpans(NamedTuple):
@@ -173,49 +168,18 @@ def _wrap(angle: Any) -> Any:
     return se2_np.wrap_angle(angle) if own is np else se2.wrap_angle(angle)
 
 
-def whitened_errors(
-    noise: CalibrationNoise, error: Any, driven: Any, match_cov: Any
-) -> tuple[Any, Any]:
-    """L^-1 e for C = L L^T, and log det C, in either namespace.
+def contradicted(calibration: Calibration, spans: MotionSpans) -> np.ndarray:
+    """The usable spans (N,) over which calibrated wheels move otherwise than the scans show.
 
     Args:
-        noise: Of wheels and scans.
-        error: (..., 3, k) [m, m, rad].
-        driven: (..., 2) [m], [rad] size of the motion by the wheels.
-        match_cov: (..., 3, 3) of scan matching.
+        calibration: Of the robot.
+        spans: Of its drive, NumPy.
     """
-    xp = error.__array_namespace__()
-    squares, floor = noise.coefficients**2, noise.floor**2
-    metres, radians = driven[..., 0], driven[..., 1]
-    along = squares[0] * metres + squares[1] * radians + floor[0]
-    turn = squares[2] * metres + squares[3] * radians + floor[1]
-    a = xp.sqrt(match_cov[..., 0, 0] + along)
-    b, c = match_cov[..., 1, 0] / a, match_cov[..., 2, 0] / a
-    d = xp.sqrt(match_cov[..., 1, 1] + along - b**2)
-    f = (match_cov[..., 2, 1] - b * c) / d
-    g = xp.sqrt(match_cov[..., 2, 2] + turn - c**2 - f**2)
-    a, b, c, d, f, g = (x[..., None] for x in (a, b, c, d, f, g))
-    first = error[..., 0, :] / a
-    second = (error[..., 1, :] - b * first) / d
-    third = (error[..., 2, :] - c * first - f * second) / g
-    log_det = 2.0 * xp.log(a * d * g)[..., 0]
-    return xp.stack([first, second, third], axis=-2), log_det
-
-
-def log_density(noise: CalibrationNoise, error: Any, driven: Any, match_cov: Any) -> Any:
-    """Log densities (...) of errors (..., 3) of spans, and their squared Mahalanobis norms (...).
-
-    Args:
-        noise: As of `whitened_errors`, and so are the others.
-        error: (..., 3).
-        driven: (..., 2).
-        match_cov: (..., 3, 3).
-    """
-    xp, nu = error.__array_namespace__(), DEGREES_OF_FREEDOM
-    whitened, log_det = whitened_errors(noise, error[..., None], driven, match_cov)
-    square = xp.sum(whitened[..., 0] ** 2, axis=-1)
-    constant = float(gammaln((nu + 3) / 2) - gammaln(nu / 2) - 1.5 * np.log(nu * np.pi))
-    return constant - log_det / 2 - (nu + 3) / 2 * xp.log1p(square / nu), square
+    error = np.abs(motion_error(calibration, spans))
+    far = np.hypot(error[:, 0], error[:, 1]), error[:, 2]
+    moved = np.hypot(spans.increment[:, 0], spans.increment[:, 1]), np.abs(spans.increment[:, 2])
+    off = [e > LEFT_SHARE * m + LEFT_OVER for e, m in zip(far, moved, strict=True)]
+    return np.asarray(spans.usable & (off[0] | off[1]))
 
 
 def estimate_calibration(
@@ -227,6 +191,9 @@ def estimate_calibration(
     sum of the squared gradients of pieces of the drive, and of the prior; or those of F^-1 where
     they are larger, as pieces of a drive without turns say nothing of the turns of another.
 
+    A robot that drives ahead by its scanner, and back by its wheels, is one whose scanner faces
+    back: the distance scale is positive.
+
     Args:
         spans: Of one drive, NumPy; none usable: the result is the prior.
         mean: Of the prior; no systematic errors by default.
@@ -237,22 +204,74 @@ def estimate_calibration(
     prior_std = default_prior_std() if prior_std is None else prior_std
     if spans.times is None:
         prior_std = prior_std._replace(time_offset=np.zeros(()))
-    middle, scale, nu = flat(mean), flat(prior_std), DEGREES_OF_FREEDOM
+    middle, scale = flat(mean), flat(prior_std)
     own = np.flatnonzero(spans.usable)
     of_spans = spans.driven[own], spans.match_cov[own]
 
     def errors(z: np.ndarray) -> np.ndarray:
         return motion_error(unflat(middle + scale * z), spans)[own]
 
+    def log_posterior(z: np.ndarray, noise: CalibrationNoise) -> float:
+        density, _ = log_density(noise, errors(z), *of_spans)
+        return float(np.sum(density)) + log_prior(noise) - float(z @ z) / 2
+
+    typical = CalibrationNoise.typical()
+    starts = _starts(scale)
+    best = starts[np.argmax([log_posterior(z, typical) for z in starts])]
+    top = _climb(starts[0], errors, of_spans)
+    if abs(best[6] - top.z[6]) * scale[6] > CLOCK_STEP:  # another maximum, perhaps
+        other = _climb(best, errors, of_spans)
+        top = max(top, other, key=lambda one: log_posterior(one.z, one.noise))
+    gradients, cov = top.gradients, top.cov
+    variance = np.diagonal(cov)
+    if len(own) >= NUM_PIECES:
+        pieces = np.stack([x.sum(axis=0) for x in np.array_split(gradients, NUM_PIECES)])
+        sandwich = cov @ (pieces.T @ pieces + np.eye(len(cov))) @ cov
+        variance = np.maximum(variance, np.diagonal(sandwich))
+    found = _driving_ahead(unflat(middle + scale * top.z), spans.mount)
+    sure = unflat(scale * np.sqrt(variance))
+    return CalibrationEstimate(found, sure, prior_std, top.noise, len(own))
+
+
+class _Top(NamedTuple):
+    """A maximum: numbers (7,) in standard deviations, noise, gradients (n, 7), covariance."""
+
+    z: np.ndarray
+    noise: CalibrationNoise
+    gradients: np.ndarray
+    cov: np.ndarray
+
+
+def _starts(scale: np.ndarray) -> np.ndarray:
+    """Numbers (K, 7) in standard deviations to climb from, the mean of the prior first."""
+    if not scale[6]:
+        return np.zeros((1, len(scale)))
+    offsets = np.arange(CLOCK_STEP, CLOCKS_APART + CLOCK_STEP / 2, CLOCK_STEP)
+    clocks = np.concatenate([[0.0], offsets, -offsets])
+    return clocks[:, None] / scale[6] * (np.arange(len(scale)) == 6)
+
+
+def _climb(
+    z: np.ndarray, errors: Callable[[np.ndarray], np.ndarray], of_spans: tuple[np.ndarray, ...]
+) -> _Top:
+    """The maximum of the posterior near numbers (7,).
+
+    Args:
+        z: In standard deviations of the prior.
+        errors: Those of the spans (n, 3), of such numbers.
+        of_spans: `driven` and `match_cov` of these spans.
+    """
+    nu = DEGREES_OF_FREEDOM
+
     def derivative(z: np.ndarray) -> np.ndarray:
         steps = DERIVATIVE_STEP * np.eye(len(z))
         columns = [(errors(z + h) - errors(z - h)) / (2 * DERIVATIVE_STEP) for h in steps]
         return np.stack(columns, axis=-1)
 
-    noise, z = CalibrationNoise.typical(), np.zeros(len(scale))
+    noise = CalibrationNoise.typical()
     for _ in range(MAX_ITERATIONS):
         error = errors(z)
-        noise = _noise_of(noise, error, *of_spans)
+        noise = fit_noise(noise, error, *of_spans)
         table = np.concatenate([error[..., None], derivative(z)], axis=-1)
         whitened, _ = whitened_errors(noise, table, *of_spans)
         residual, jacobian = whitened[..., 0], whitened[..., 1:]
@@ -265,45 +284,14 @@ def estimate_calibration(
         z = z + step
         if np.all(np.abs(step) <= CONVERGED * np.sqrt(np.diagonal(cov))):
             break
-    variance = np.diagonal(cov)
-    if len(own) >= NUM_PIECES:
-        pieces = np.stack([x.sum(axis=0) for x in np.array_split(gradients, NUM_PIECES)])
-        sandwich = cov @ (pieces.T @ pieces + np.eye(len(z))) @ cov
-        variance = np.maximum(variance, np.diagonal(sandwich))
-    return CalibrationEstimate(
-        unflat(middle + scale * z), unflat(scale * np.sqrt(variance)), prior_std, noise, len(own)
-    )
+    return _Top(z, noise, gradients, cov)
 
 
-def _noise_of(
-    start: CalibrationNoise, error: np.ndarray, driven: np.ndarray, match_cov: np.ndarray
-) -> CalibrationNoise:
-    """The noise of greatest probability, of errors (N, 3)."""
-    typical, nu = np.log(np.concatenate(CalibrationNoise.typical())), DEGREES_OF_FREEDOM
-    table = np.concatenate([error[..., None], np.tile(np.eye(3), (len(error), 1, 1))], axis=-1)
-    ones = np.ones(len(driven))
-    along = np.stack([driven[:, 0], driven[:, 1], 0 * ones, 0 * ones, ones, 0 * ones], axis=1)
-    turn = np.stack([0 * ones, 0 * ones, driven[:, 0], driven[:, 1], 0 * ones, ones], axis=1)
-
-    def noise(logs: np.ndarray) -> CalibrationNoise:
-        return CalibrationNoise(np.exp(logs[:4]), np.exp(logs[4:]))
-
-    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        """Negative log posterior, and its gradient.
-
-        Of log p, by an element q of the diagonal of C: (w (C^-1 e)^2 - C^-1) / 2.
-        """
-        whitened, log_det = whitened_errors(noise(logs), table, driven, match_cov)
-        residual, root = whitened[..., 0], whitened[..., 1:]
-        square = np.sum(residual**2, axis=-1)
-        value = np.sum(log_det + (nu + 3) * np.log1p(square / nu)) / 2
-        pull = np.einsum("nai,na->ni", root, residual)
-        weight = (nu + 3) / (nu + square)
-        slope = (np.sum(root**2, axis=1) - weight[:, None] * pull**2) / 2
-        by_variance = along.T @ (slope[:, 0] + slope[:, 1]) + turn.T @ slope[:, 2]
-        off = (logs - typical) / NOISE_LOG_STD
-        gradient = by_variance * 2 * np.exp(2 * logs) + off / NOISE_LOG_STD
-        return float(value + np.sum(off**2) / 2), gradient
-
-    start_logs = np.log(np.concatenate(start))
-    return noise(minimize(cost, start_logs, jac=True, method="L-BFGS-B").x)
+def _driving_ahead(calibration: Calibration, mount: np.ndarray) -> Calibration:
+    """The same motion by a distance scale that is positive: the scanner then faces back."""
+    if calibration.distance_scale >= 0.0:
+        return calibration
+    place = se2_np.compose(mount, np.asarray(calibration.mount))
+    back = se2_np.compose(np.array([0.0, 0.0, np.pi]), place)
+    scale = np.asarray(-calibration.distance_scale)
+    return calibration._replace(distance_scale=scale, mount=se2_np.relative(mount, back))

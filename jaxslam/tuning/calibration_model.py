@@ -16,15 +16,13 @@ import numpy as np
 from jaxslam.core.batching import pad_to
 from jaxslam.core.calibration import Calibration
 from jaxslam.core.types import Array
+from jaxslam.smoothing.calibration_noise import NOISE_LOG_STD, CalibrationNoise, log_density
 from jaxslam.smoothing.odometry_calibration import (
     DETERMINED,
-    NOISE_LOG_STD,
     CalibrationEstimate,
-    CalibrationNoise,
     MotionSpans,
     default_prior_std,
     flat,
-    log_density,
     motion_error,
     unflat,
 )

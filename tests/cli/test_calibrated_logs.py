@@ -1,18 +1,22 @@
 """`--calibrate` and `--calibration`: what is refused at once, and what a run writes."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import test_run_logs
+import wheel_drives
 from test_run_logs import refused
 
-from jaxslam.cli import calibrated_logs, main
+from jaxslam.cli import calibrated_logs, main, run_command
 from jaxslam.core.calibration import Calibration
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.scan import Lidar
 from jaxslam.io import calibration_file, readers
 from jaxslam.io.calibration_file import RobotCalibration
+from jaxslam.io.errors import InputError
+from jaxslam.pipeline import log_input
 
 
 def calibration_of(path, log, **changes):
@@ -80,6 +84,55 @@ def test_lines_name_what_is_not_determined():
     assert lines[0].split() == ["distance_scale", "1.0500", "+-", "0.0010"]
     assert lines[5].split() == ["mount[2]", "3.0000", "+-", "0.1000", "deg"]
     assert [line for line in lines if "not determined" in line] == [lines[3]]
+    assert not [line for line in lines if "far from" in line]
+    turned = robot.calibration._replace(mount=np.array([0.0, 0.0, 1.5]))
+    lines = calibrated_logs.calibration_lines(robot._replace(calibration=turned))
+    assert [line for line in lines if "far from" in line] == [lines[5]]
+
+
+def small_log(mount=(0.0, 0.0, 0.0)):
+    """Four scans of a robot that drives ahead."""
+    poses = np.outer(np.arange(4), [0.3, 0.0, 0.0])
+    lidar = Lidar(40, -1.0, 0.05, 10.0)
+    log = LaserLog.from_arrays(0.5 * np.arange(4), poses, np.full((4, 40), 3.0), lidar)
+    return log._replace(mount=np.array(mount))
+
+
+def test_logs_of_two_robots_are_not_calibrated_together():
+    logs = [small_log(), small_log((0.3, 0.0, 0.0))]
+    paths = [Path("a.npz"), Path("b.npz")]
+    with pytest.raises(InputError) as caught:
+        calibrated_logs.check_same_robot(paths, logs)
+    assert str(caught.value).startswith("--calibrate: a.npz: robot.mount: is of another robot")
+    assert "and b.npz has [0.3 0.  0. ]; only logs of one robot" in str(caught.value)
+    calibrated_logs.check_same_robot(paths, logs[:1] * 2)
+
+
+def test_what_a_calibration_leaves_open_is_named_where_it_is_used(tmp_path, capsys):
+    log = small_log()
+    file = calibration_of(tmp_path / "c.json", log, not_determined=("mount[0]", "time_offset"))
+    robot, given = calibration_file.read(file), log_input.from_laser_log(log)
+    calibrated_logs.use_calibration(Path("a.npz"), log, given, robot)
+    assert capsys.readouterr().out.endswith("; not determined: mount[0], time_offset\n")
+
+
+def test_wheels_that_contradict_the_scans_are_warned_of(capsys):
+    spans = wheel_drives.drive(np.random.default_rng(0), 40)
+    calibrated_logs.print_contradictions(Path("a.clf"), wheel_drives.TRUE, spans)
+    assert not capsys.readouterr().out
+    increment = spans.increment + np.outer(np.arange(39) < 12, [1.0, 0.0, 0.0])
+    wrong = spans._replace(increment=increment)
+    calibrated_logs.print_contradictions(Path("a.clf"), wheel_drives.TRUE, wrong)
+    printed = capsys.readouterr().out
+    assert printed.startswith("WARNING: a.clf: calibrated wheels do not move as the scans show at")
+    assert "12 of 39 spans" in printed
+
+
+def test_a_calibration_of_an_earlier_run_is_noted(tmp_path):
+    (tmp_path / "calibration.json").write_text("{}")
+    (note,) = run_command.left_from_before(tmp_path, [], 1)
+    assert note.endswith("calibration.json of an earlier run stay there")
+    assert not run_command.left_from_before(tmp_path, ["calibration.json"], 1)
 
 
 @pytest.mark.slow

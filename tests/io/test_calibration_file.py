@@ -78,10 +78,12 @@ def drop(*keys):
     [
         (put("format", "jaxslam-noise"), "format: is no jaxslam-calibration file"),
         (put("version", 2), "version: 2 instead of 1"),
+        (put("version", True), "version: True instead of 1"),
         (put("calibration", "distance_scale", 0), "calibration.distance_scale: 0.0 is not between"),
         (put("calibration", "turn_scale", -1.0), "calibration.turn_scale: -1.0 is not between"),
         (put("calibration", "mount", [0, 0]), "calibration.mount: is not 3 numbers"),
         (put("calibration", "mount", [0, [1], 2]), "calibration.mount: is not 3 numbers"),
+        (put("calibration", "mount", [True, 0, 0]), "calibration.mount: is not 3 numbers"),
         (put("calibration", "time_offset", "0"), "calibration.time_offset: is not a number"),
         (put("calibration", "time_offset", True), "calibration.time_offset: is not a number"),
         (put("calibration", "time_offset", 1e400), "is not JSON (Infinity is no number of JSON)"),
@@ -92,6 +94,7 @@ def drop(*keys):
         (drop("robot"), "robot: missing"),
         (put("standard_errors", "mount", [0, 0, -1]), "standard_errors.mount: [0.0, 0.0, -1.0] is"),
         (put("not_determined", "all"), "not_determined: holds something that is no text"),
+        (put("not_determined", ["mount"]), "not_determined: 'mount'; the names are distance_sc"),
         (put("robot", "num_beams", 2.5), "robot.num_beams: 2.5 is no whole number"),
         (put("robot", "angle_increment", 0), "robot.angle_increment: 0.0 is not between"),
         (put("robot", "base_frame", 3), "robot.base_frame, robot.scan_frame: holds something"),
@@ -115,6 +118,15 @@ def test_a_calibration_out_of_its_limits_is_not_written(tmp_path):
     with pytest.raises(InputError, match=r"calibration\.turn_scale: nan is not between"):
         calibration_file.write(tmp_path / "a.json", wrong)
     assert not (tmp_path / "a.json").exists()
+
+
+def test_a_calibration_that_no_robot_has_names_the_log():
+    calibration_file.require_possible("a.clf", FOUND.calibration)
+    with pytest.raises(InputError) as caught:
+        wrong = FOUND.calibration._replace(distance_scale=np.asarray(0.101))
+        calibration_file.require_possible("a.clf", wrong)
+    assert str(caught.value).startswith("a.clf: distance_scale: the calibration is found to be 0.1")
+    assert "check the units" in str(caught.value)
 
 
 @pytest.mark.parametrize(

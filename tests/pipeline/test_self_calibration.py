@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import wheel_drives
 from office_drive import LIDAR, scans_along
 
 from jaxslam.core.calibration import Calibration
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.se2_np import compose, dead_reckoning, relative
-from jaxslam.pipeline import log_input, self_calibration
+from jaxslam.pipeline import log_input, motion_spans, self_calibration
 from jaxslam.simulation import drives, path_following, worlds
 from jaxslam.simulation.robot import Robot
 from jaxslam.smoothing.odometry_calibration import flat
@@ -23,15 +24,17 @@ HURT = Robot(
 def test_times_that_cannot_be_trusted():
     back = np.arange(10.0)
     back[4] = 1.0
-    assert self_calibration.usable_times(back) is None
-    assert self_calibration.usable_times(np.full(10, 7.0)) is None
+    assert motion_spans.usable_times(back) is None
+    assert motion_spans.usable_times(np.full(10, 7.0)) is None
     some = np.repeat(np.arange(200.0), 2)
     some[7] = 0.0
-    found = self_calibration.usable_times(some)
+    found = motion_spans.usable_times(some)
     assert np.all(np.diff(found) > 0) and np.abs(found - np.maximum.accumulate(some)).max() < 1e-3
 
 
-@pytest.mark.parametrize("place", [[0.0, 0.0, 0.0], [-0.25, 0.0, -0.05]])
+@pytest.mark.parametrize(
+    "place", [[0.0, 0.0, 0.0], [-0.25, 0.0, -0.05], [0.1, 0.0, 1.6], [0.0, 0.0, -1.5]]
+)
 def test_the_frame_between_the_wheels_is_found(place):
     """From how the poses of a scanner move sideways, a tenth of them by anything."""
     rng = np.random.default_rng(0)
@@ -41,11 +44,11 @@ def test_the_frame_between_the_wheels_is_found(place):
     wheels[:, 1] += 0.002 * rng.normal(size=300)
     wheels[::10, 1] += 0.2 * rng.normal(size=30)
     moved = compose(compose(relative(np.array(place), NO_TIME), wheels), np.array(place))
-    found = self_calibration.wheel_frame(moved, np.zeros(3), np.ones(300, bool))
+    found = motion_spans.wheel_frame(moved, np.zeros(3), np.ones(300, bool))
     np.testing.assert_allclose(found, place, atol=2e-3)
     # The same robot, whose log says where its scanner is.
     mount = np.array([0.1, 0.3, 1.0])
-    on_robot = self_calibration.wheel_frame(
+    on_robot = motion_spans.wheel_frame(
         compose(compose(relative(mount, NO_TIME), moved), mount), mount, np.ones(300, bool)
     )
     np.testing.assert_allclose(on_robot, compose(np.array(place), mount), atol=2e-3)
@@ -54,7 +57,7 @@ def test_the_frame_between_the_wheels_is_found(place):
 def test_a_robot_that_drives_to_all_sides_keeps_its_frame():
     moved = np.random.default_rng(1).normal(size=(300, 3)) * [0.3, 0.3, 0.2]
     mount = np.array([0.3, 0.1, 0.2])
-    found = self_calibration.wheel_frame(moved, mount, np.ones(300, bool))
+    found = motion_spans.wheel_frame(moved, mount, np.ones(300, bool))
     np.testing.assert_array_equal(found, mount)
 
 
@@ -78,6 +81,41 @@ def test_rounds_that_close_in_slowly_are_cut_short():
     assert np.all(np.abs(apart) <= 4 * np.abs(f0))
     held = self_calibration.left_over([(x0, 0 * f0), (x0, 0 * f0)])
     np.testing.assert_array_equal(held, 0.0)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"usable": np.zeros(39, bool)}, "no motion to calibrate by: no two scans"),
+        ({"increment": np.tile([0.0, 0.4, 0.3], (39, 1))}, "as its scans show at 39 of 39 spans"),
+    ],
+)
+def test_wheels_that_say_nothing_of_the_motion_are_refused(wrong, message):
+    spans = wheel_drives.drive(np.random.default_rng(0), 40)
+    self_calibration.require_agreement(wheel_drives.TRUE, spans)
+    with pytest.raises(ValueError, match=message):
+        self_calibration.require_agreement(wheel_drives.TRUE, spans._replace(**wrong))
+
+
+def test_a_mirrored_scanner_is_named():
+    mirrored = wheel_drives.TRUE._replace(turn_scale=np.asarray(-1.0))
+    spans = wheel_drives.drive(np.random.default_rng(0), 40, true=mirrored)
+    with pytest.raises(ValueError, match=r"turn against its wheels, .* see --upside-down"):
+        self_calibration.require_agreement(mirrored, spans)
+
+
+@pytest.mark.parametrize("step, noted", [(0.0, True), (0.5, False)])
+def test_a_time_offset_that_cannot_be_used_is_noted(step, noted):
+    poses = np.outer(np.arange(4), [0.3, 0.0, 0.1])
+    ranges = np.full((4, LIDAR.num_beams), 3.0)
+    log = LaserLog.from_arrays(step * np.arange(4), poses, ranges, LIDAR)
+    given = log_input.from_laser_log(log)
+    offset = Calibration.identity()._replace(time_offset=np.asarray(0.1))
+    moved = self_calibration.calibrated(log, given, offset, NO_TIME)
+    assert any("time offset is not used" in note for note in moved.notes) == noted
+    assert np.array_equal(moved.increments.round(9), given.increments.round(9)) == noted
+    none = self_calibration.calibrated(log, given, Calibration.identity(), NO_TIME)
+    assert none.notes == given.notes
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ from wheel_drives import TRUE
 
 from jaxslam.core.calibration import Calibration
 from jaxslam.core.se2_np import compose, dead_reckoning, relative
-from jaxslam.smoothing import odometry_calibration
+from jaxslam.smoothing import calibration_noise, odometry_calibration
+from jaxslam.smoothing.calibration_noise import CalibrationNoise
 from jaxslam.smoothing.odometry_calibration import (
     NAMES,
-    CalibrationNoise,
     default_prior_std,
     estimate_calibration,
     flat,
@@ -48,7 +48,7 @@ def test_density_is_that_of_the_multivariate_t_distribution():
     along = 0.1**2 * 0.7 + 0.2**2 * 0.2 + 0.5**2
     turn = 0.3**2 * 0.7 + 0.4**2 * 0.2 + 0.6**2
     scale = cov + np.diag([along, along, turn])
-    density, square = odometry_calibration.log_density(noise, error, driven, cov)
+    density, square = calibration_noise.log_density(noise, error, driven, cov)
     reference = scipy.stats.multivariate_t(shape=scale, df=3).logpdf(error)
     np.testing.assert_allclose(density, reference, rtol=1e-12)
     np.testing.assert_allclose(square, error @ np.linalg.solve(scale, error), rtol=1e-12)
@@ -147,4 +147,41 @@ def test_a_mount_that_is_moved_is_found_moved():
     one, two = estimate_calibration(spans), estimate_calibration(other)
     np.testing.assert_allclose(
         two.calibration.mount, compose(place, one.calibration.mount), atol=2e-3
+    )
+
+
+@pytest.mark.parametrize("offset", [1.0, -1.5, 4.3])
+def test_clocks_that_are_seconds_apart_are_found(offset):
+    """Small steps alone end at a third of it, and say that they are sure."""
+    true = TRUE._replace(time_offset=np.asarray(offset))
+    found = estimate_calibration(wheel_drives.drive(np.random.default_rng(1), 80, true=true))
+    off = (flat(found.calibration) - flat(true)) / flat(found.standard_errors)
+    assert np.all(np.abs(off) < 4), off
+
+
+@pytest.mark.parametrize("taken", [[0.0, 0.0, 0.0], [0.3, 0.1, 0.2]])
+def test_a_scanner_that_faces_back_is_found(taken):
+    """And not wheels that roll the wrong way; in the frame between them all is as it was."""
+    true = TRUE._replace(mount=np.array([0.2, 0.05, np.pi - 0.02]))
+    spans, place = wheel_drives.drive(np.random.default_rng(10), 100, true=true), np.array(taken)
+    odometry = compose(compose(relative(place, np.zeros(3)), spans.odometry), place)
+    odometry[0] = 0.0
+    wanted = true._replace(mount=relative(place, true.mount))
+    found = estimate_calibration(spans._replace(odometry=odometry, mount=place))
+    off = flat(found.calibration) - flat(wanted)
+    off[5] = np.arctan2(np.sin(off[5]), np.cos(off[5]))
+    assert np.all(np.abs(off) < 4 * flat(found.standard_errors)), off
+
+
+def test_spans_that_calibrated_wheels_contradict():
+    spans = wheel_drives.drive(np.random.default_rng(11), 100)
+    assert not odometry_calibration.contradicted(TRUE, spans).any()
+    increment = spans.increment.copy()
+    increment[[3, 7]] += [[0.5, 0.0, 0.0], [0.0, 0.0, -0.5]]
+    usable = np.arange(99) != 7
+    off = odometry_calibration.contradicted(TRUE, spans._replace(increment=increment))
+    np.testing.assert_array_equal(np.flatnonzero(off), [3, 7])
+    some = spans._replace(increment=increment, usable=usable)
+    np.testing.assert_array_equal(
+        np.flatnonzero(odometry_calibration.contradicted(TRUE, some)), [3]
     )

@@ -5,12 +5,8 @@ import numpy as np
 import pytest
 import wheel_drives
 
-from jaxslam.smoothing.odometry_calibration import (
-    estimate_calibration,
-    flat,
-    log_density,
-    motion_error,
-)
+from jaxslam.smoothing.calibration_noise import log_density
+from jaxslam.smoothing.odometry_calibration import estimate_calibration, flat, motion_error
 from jaxslam.tuning import calibration_model
 from jaxslam.tuning.calibration_model import CALIBRATION_MODEL, CalibrationParams
 from jaxslam.tuning.model import run_model

@@ -107,9 +107,7 @@ def calibrate_log(
         calibration = unflat(start)
         moved = calibrate_odometry(calibration, odometry, times=times, mount=taken)
         matches = online.match_log(given.config, moved, given.scans, odometry_guessed=guessed)
-        spans = motion_spans.spans_between_keyframes(
-            given, odometry, matches, guessed, times, taken
-        )
+        spans = motion_spans.between_keyframes(given, odometry, matches, guessed, times, taken)
         estimate = estimate_calibration(spans, mean, prior_std)
         change = flat(estimate.calibration) - start
         change[5] = wrap_angle(change[5])

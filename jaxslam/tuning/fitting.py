@@ -43,6 +43,10 @@ from jaxslam.tuning.tune_state import result as result
 
 Transforms = tuple[Transform, ...]
 
+QUICK_STEPS = 20_000
+"""Steps of all sequences up to which programs are compiled in half the time, and run, some of them,
+a seventh slower."""
+
 
 def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any) -> Array:
     """Loss () of one sequence."""
@@ -60,15 +64,21 @@ def _value_and_gradient(
 
 
 @cache
-def _over_devices(function: Callable[..., Any], batch_size: int) -> DeviceMap:
+def _over_devices(function: Callable[..., Any], batch_size: int, quickly: bool) -> DeviceMap:
     """A function of one sequence over many; the same object for the same arguments."""
-    return DeviceMap(function, size=batch_size, static=3, compile_quickly=True)
+    return DeviceMap(function, size=batch_size, static=3, compile_quickly=quickly)
+
+
+def _is_short(data: Any) -> bool:
+    """Whether compiling takes longer than some tens of evaluations of data [B]."""
+    leaves = jax.tree.leaves(data)
+    return len(leaves[0]) * max(x.shape[1] if x.ndim > 1 else 1 for x in leaves) <= QUICK_STEPS
 
 
 def _evaluate(function: Callable[..., Any], problem: Problem) -> Any:
     """`_value` or `_value_and_gradient` of all sequences of a problem."""
     model, loss, transforms, params, data, theta = problem
-    run = _over_devices(function, model.batch_size)
+    run = _over_devices(function, model.batch_size, _is_short(data))
     if theta is None:
         return run(model, loss, transforms, unconstrain(params, transforms), data)
     return run(model, loss, transforms, theta_tree(theta, params, transforms), data)

@@ -6,6 +6,7 @@ import numpy as np
 import optax
 import pytest
 
+from jaxslam.core.devices import DeviceMap
 from jaxslam.tuning import (
     CHOLESKY,
     POSITIVE,
@@ -227,3 +228,24 @@ def test_tuning_is_the_same_in_any_unit(unit):
 def test_a_parameter_without_numbers_may_be_there_and_be_frozen():
     params = START | {"none": np.zeros((0, 3))}
     assert tuned(params=params, frozen=("none", "q")).params["q"] == 1.0
+
+
+def test_only_short_data_are_compiled_quickly(monkeypatch):
+    used = []
+
+    class Recorded(DeviceMap):
+        def __init__(self, function, **given):
+            used.append(given["compile_quickly"])
+            super().__init__(function, **given)
+
+    monkeypatch.setattr(fitting, "DeviceMap", Recorded)
+    monkeypatch.setattr(fitting, "QUICK_STEPS", 12)
+    fitting._over_devices.cache_clear()
+    model = Model(lambda params, data: 0.0, lambda params, state, x: (state, x * params))
+    found = [
+        fitting.values(model, jnp.float64(2.0), np.ones((count, 4)), lambda info, data: info.mean())
+        for count in (3, 4)
+    ]
+    assert used == [True, False]
+    np.testing.assert_allclose(found[1], 2.0)
+    fitting._over_devices.cache_clear()

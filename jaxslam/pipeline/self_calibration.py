@@ -92,20 +92,16 @@ def calibrate_log(
             its scans show.
     """
     require_wheels(log, given.odometry_source)
-    calibration = Calibration.identity() if mean is None else mean
     odometry, is_share, _ = _shared(given)
     guessed = _guessed(given) | is_share
-    taken = (
-        motion_spans.wheel_frame(odometry, log.mount, ~guessed)
-        if mount is None
-        else np.asarray(mount)
-    )
-    times, start = motion_spans.usable_times(log.times), flat(calibration)
+    if mount is None:
+        mount = motion_spans.wheel_frame(odometry, log.mount, ~guessed)
+    taken, times = np.asarray(mount), motion_spans.usable_times(log.times)
+    start = flat(Calibration.identity() if mean is None else mean)
     rounds: list[tuple[np.ndarray, np.ndarray]] = []
     is_settled = False
     while len(rounds) < MAX_ROUNDS and not is_settled:
-        calibration = unflat(start)
-        moved = calibrate_odometry(calibration, odometry, times=times, mount=taken)
+        moved = calibrate_odometry(unflat(start), odometry, times=times, mount=taken)
         matches = online.match_log(given.config, moved, given.scans, odometry_guessed=guessed)
         spans = motion_spans.between_keyframes(given, odometry, matches, guessed, times, taken)
         estimate = estimate_calibration(spans, mean, prior_std)

@@ -161,7 +161,7 @@ def test_clocks_that_are_seconds_apart_are_found(offset):
 
 @pytest.mark.parametrize("taken", [[0.0, 0.0, 0.0], [0.3, 0.1, 0.2]])
 def test_a_scanner_that_faces_back_is_found(taken):
-    """And not wheels that roll the wrong way; in the frame between them all is as it was."""
+    """And not wheels that roll backwards; in the frame between them all is as it was."""
     true = TRUE._replace(mount=np.array([0.2, 0.05, np.pi - 0.02]))
     spans, place = wheel_drives.drive(np.random.default_rng(10), 100, true=true), np.array(taken)
     odometry = compose(compose(relative(place, np.zeros(3)), spans.odometry), place)

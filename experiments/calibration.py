@@ -307,13 +307,14 @@ def main(argv: list[str] | None = None) -> int:
         print("  starts are apart by at most", row["starts_apart_se"], "standard errors")
         repeated = row["repetitions_within_3_se"]
         print(f"  repetitions within 3 standard errors: {repeated} of {row['repetitions']}")
-        print("  warnings:", *row["warnings"])
+        for warning in row["warnings"]:
+            print("  warning:", warning)
         print("  held-out RMSE per that of the known calibration:", row["heldout_ratio"])
         for name, ratio in zip(row["names"], row["error_per_spread"], strict=True):
             if name.startswith("calibration."):
                 print(f"  {name}: standard error per spread {ratio:.2f}")
     print({key: value for key, value in others.items() if key.endswith("rmse_m")})
-    print("straight drives:", *along["warnings"])
+    print("straight drives:", "; ".join(along["warnings"]))
     within, worst = scans["within_3_se"], scans["worst_z"]
     print(
         f"logs of scans: {within} of {scans['logs']} within 3 standard errors, largest {worst:.1f}"

@@ -143,10 +143,10 @@ def find_calibration(
     print_calibration(robot, f"calibration of {path}, by {counts}:")
     if not found.is_settled:
         print("note: the calibration still changed when the scans were matched last")
-    print_contradictions(path, found.estimate.calibration, found.spans)
+    num_off = print_contradictions(path, found.estimate.calibration, found.spans)
     about = {
         "spans": num_spans,
-        "contradicted_spans": int(contradicted(found.estimate.calibration, found.spans).sum()),
+        "contradicted_spans": num_off,
         "rounds": found.num_rounds,
         "settled": found.is_settled,
     }
@@ -233,13 +233,16 @@ def print_calibration(robot: RobotCalibration, title: str) -> None:
         print(f"  {line}")
 
 
-def print_contradictions(path: Path, calibration: Calibration, spans: MotionSpans) -> None:
+def print_contradictions(path: Path, calibration: Calibration, spans: MotionSpans) -> int:
     """Print where calibrated wheels move otherwise than the scans show, if that is often.
 
     Args:
         path: The log.
         calibration: Of its robot.
         spans: Of its drive.
+
+    Returns:
+        At how many spans they do.
     """
     num_off, count = int(contradicted(calibration, spans).sum()), int(spans.usable.sum())
     if num_off > NOTED_CONTRADICTIONS * count:
@@ -247,6 +250,7 @@ def print_contradictions(path: Path, calibration: Calibration, spans: MotionSpan
             f"WARNING: {path}: calibrated wheels do not move as the scans show at {num_off} of "
             f"{count} spans, so the calibration may be off by more than its standard errors"
         )
+    return num_off
 
 
 def use_calibration(

@@ -101,7 +101,7 @@ def estimates_of(report: TuneReport) -> "list[Estimate]":
     own_errors = [] if errors is None else jax.tree.leaves(errors.of_params)
     for k, transform in enumerate(transforms.of_leaves(report.found)):
         shape = np.shape(leaves[1][k])
-        is_factor = transform.forward is transforms.CHOLESKY.forward
+        is_factor = transform.is_of_matrix
         count = shape[0] * (shape[0] + 1) // 2 if is_factor else math.prod(shape)
         own = slice(first, first + count)
         first += count

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.types import Array
-from jaxslam.tuning.transforms import CHOLESKY, Transform, of_leaves
+from jaxslam.tuning.transforms import Transform, of_leaves
 
 
 def constrain(theta: Any, transforms: Sequence[Transform]) -> Any:
@@ -64,7 +64,7 @@ def as_params(params: Any, transforms: Any = None, *, name: str = "params") -> A
         if numbers.dtype.kind not in "fiu" and not jnp.issubdtype(numbers.dtype, jnp.floating):
             what = f"an array of {leaf.dtype}" if np.ndim(leaf) else f"a {type(leaf).__name__}"
             raise ValueError(f"{own} is {what}, not a number")
-        if transform is CHOLESKY and numbers.ndim != 2:
+        if transform.is_of_matrix and numbers.ndim != 2:
             raise ValueError(f"{own} is of the shape {numbers.shape}, not a matrix in one array")
         arrays.append(_as_param(own, numbers, transform))
     return jax.tree.unflatten(jax.tree.structure(params), arrays)
@@ -119,7 +119,7 @@ def _theta_leaves(theta: Any, like: Any, transforms: Sequence[Transform]) -> lis
 def theta_shape(leaf: Any, transform: Transform) -> tuple[int, ...]:
     """Shape of the unconstrained numbers of a leaf of the parameters."""
     shape = np.shape(leaf)
-    if transform.forward is CHOLESKY.forward:
+    if transform.is_of_matrix:
         return (shape[0] * (shape[0] + 1) // 2,)
     return shape
 
@@ -158,7 +158,7 @@ def param_names(params: Any, transforms: Any = None) -> tuple[str, ...]:
     paths = jax.tree_util.tree_leaves_with_path(params)
     for (path, leaf), transform in zip(paths, of_leaves(params, transforms), strict=True):
         own, shape = _path_text(path), np.shape(leaf)
-        if transform.forward is CHOLESKY.forward:
+        if transform.is_of_matrix:
             indices = np.stack(np.tril_indices(shape[0]), axis=1)
         else:
             indices = np.argwhere(np.ones(shape, bool)) if shape else np.zeros((1, 0), int)

@@ -50,6 +50,11 @@ class Transform(NamedTuple):
     text: str
     constants: tuple = ()
 
+    @property
+    def is_of_matrix(self) -> bool:
+        """Whether the parameter is a matrix, its numbers those of a triangle: `CHOLESKY`."""
+        return self.forward is _of_cholesky
+
 
 def _real_forward(theta: Any, scale: Any) -> Any:
     return theta * theta.__array_namespace__().asarray(scale, dtype=theta.dtype)

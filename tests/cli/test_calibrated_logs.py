@@ -118,11 +118,11 @@ def test_what_a_calibration_leaves_open_is_named_where_it_is_used(tmp_path, caps
 
 def test_wheels_that_contradict_the_scans_are_warned_of(capsys):
     spans = wheel_drives.drive(np.random.default_rng(0), 40)
-    calibrated_logs.print_contradictions(Path("a.clf"), wheel_drives.TRUE, spans)
+    assert calibrated_logs.print_contradictions(Path("a.clf"), wheel_drives.TRUE, spans) == 0
     assert not capsys.readouterr().out
     increment = spans.increment + np.outer(np.arange(39) < 12, [1.0, 0.0, 0.0])
     wrong = spans._replace(increment=increment)
-    calibrated_logs.print_contradictions(Path("a.clf"), wheel_drives.TRUE, wrong)
+    assert calibrated_logs.print_contradictions(Path("a.clf"), wheel_drives.TRUE, wrong) == 12
     printed = capsys.readouterr().out
     assert printed.startswith("WARNING: a.clf: calibrated wheels do not move as the scans show at")
     assert "12 of 39 spans" in printed

@@ -14,7 +14,7 @@ import jaxslam
 HOME = Path(next(iter(jaxslam.__path__)))
 PACKAGES = (
     "core frontend matching filtering smoothing mapping localisation pipeline evaluation "
-    "simulation tuning io viz cli"
+    "simulation tuning io study viz cli"
 ).split()
 FILES = sorted(HOME.rglob("*.py"))
 MAX_LINES = 350

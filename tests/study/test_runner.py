@@ -1,0 +1,80 @@
+"""Trials of a study: the same after a stop, paired over variants, refused if of something else."""
+
+import numpy as np
+import pytest
+
+from jaxslam import Config, NoiseParams
+from jaxslam.core.scan import Lidar
+from jaxslam.io.errors import InputError
+from jaxslam.simulation import Robot, densify, named
+from jaxslam.study import runner
+from jaxslam.study.runner import Variant, run
+
+LIDAR = Lidar(num_beams=61, angle_min=-1.5, angle_increment=0.05)
+CONFIG = Config.for_lidar(LIDAR)
+CONFIG = CONFIG._replace(filter=CONFIG.filter._replace(max_landmarks=16))
+PATH = densify([(1.0, 0.9), (2.5, 0.9)])
+
+
+def variant(name="a", **changes):
+    given = {
+        "config": CONFIG,
+        "params": NoiseParams.for_simulated_robot(),
+        "robot": Robot(),
+        "world": named("office"),
+        "path": PATH,
+        "num_scans": 4,
+    }
+    return Variant(name, {}, **(given | changes))
+
+
+@pytest.fixture
+def small_files(monkeypatch):
+    monkeypatch.setattr(runner, "TRIALS_PER_FILE", 4)
+
+
+class Stop(Exception):
+    pass
+
+
+def stop_after(variant_number, done):
+    def callback(progress):
+        if (progress.variant, progress.done) >= (variant_number, done):
+            raise Stop
+
+    return callback
+
+
+def assert_same(first, second):
+    for one, other in zip(first, second, strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_study_that_is_stopped_ends_with_the_same_outcomes(tmp_path, small_files):
+    both = [variant(), variant("b", params=NoiseParams.for_simulated_robot(0.4, 0.01))]
+    whole = run(both, num_trials=10, seed=3)
+    assert len(whole[0].finite) == 10 and whole[0].error.shape == (10, 4)
+    with pytest.raises(Stop):
+        run(both, num_trials=10, seed=3, folder=tmp_path, callback=stop_after(1, 4))
+    seen = []
+    found = run(both, num_trials=10, seed=3, folder=tmp_path, callback=seen.append)
+    assert_same(found, whole)
+    assert {one.variant for one in seen} == {1}  # the first variant was done
+    assert_same(run(both, num_trials=10, seed=3, folder=tmp_path, callback=seen.clear), whole)
+    np.testing.assert_array_equal(whole[0].place, whole[1].place)  # the same drives
+    assert np.any(whole[0].error != whole[1].error)
+
+
+def test_trials_of_something_else_are_refused(tmp_path, small_files):
+    run([variant()], num_trials=4, seed=3, folder=tmp_path)
+    with pytest.raises(InputError, match="0000000.npz: has trials of another variant, seed"):
+        run([variant()], num_trials=4, seed=4, folder=tmp_path)
+    other = variant(robot=Robot(encoder_noise=0.01))
+    with pytest.raises(InputError, match="remove it, or name another folder"):
+        run([other], num_trials=4, seed=3, folder=tmp_path)
+    (file,) = tmp_path.glob("000/*.npz")
+    file.write_bytes(b"PK")
+    with pytest.raises(InputError, match="is broken"):
+        run([variant()], num_trials=4, seed=3, folder=tmp_path)
+    assert runner.fingerprint(variant("other name"), 3) == runner.fingerprint(variant(), 3)

@@ -32,6 +32,7 @@ from jaxslam.simulation.robot import Robot
 from jaxslam.tuning import fitting, parameters, standard_errors
 from jaxslam.tuning.calibrated import CalibratedParams, calibrate_episode, calibrated_slam_model
 from jaxslam.tuning.optimizers import newton
+from jaxslam.tuning.tune_state import TuneResult
 
 NAME = "calibration"
 LOSSES = ("innovation_nll", "pose_nll")
@@ -79,26 +80,39 @@ def approach(loss: str, params: CalibratedParams, train: Episode) -> CalibratedP
 
 
 def hessian_of(loss: str, params: CalibratedParams, train: Episode) -> common.Numbers:
-    """Hessian (P, P) of the mean loss over all drives, where `approach` arrived."""
+    """Hessian (P, P) of the mean loss over all drives, near the minimum that a start leads to.
+
+    That where `approach` arrives differs too much from it along the least curved directions.
+    """
     near = approach(loss, params, train)
-    problem = fitting.prepare(MODEL, near, train, loss)
-    theta = parameters.flatten_params(near)
+    near = polish(loss, near, _hessian_at(loss, near, train), train).params
+    return {"hessian": _hessian_at(loss, near, train)}
+
+
+def _hessian_at(loss: str, params: CalibratedParams, train: Episode) -> np.ndarray:
+    problem = fitting.prepare(MODEL, params, train, loss)
+    theta = parameters.flatten_params(params)
     every = np.ones(len(theta), bool)
-    return {"hessian": standard_errors.second_derivatives(problem, theta, every)[0]}
+    return standard_errors.second_derivatives(problem, theta, every)[0]
+
+
+def polish(loss: str, params: CalibratedParams, hessian: np.ndarray, drives: Episode) -> TuneResult:
+    """The last of a tuning, on all of some drives."""
+    return fitting.tune(
+        MODEL,
+        params,
+        drives,
+        loss=loss,
+        num_updates=NEWTON_UPDATES,
+        optimizer=newton(hessian),
+    )
 
 
 def recover(
     loss: str, params: CalibratedParams, hessian: np.ndarray, train: Episode, test: Episode
 ) -> common.Numbers:
     """Tune from a start: on a part of the drives, then on all of them."""
-    found = fitting.tune(
-        MODEL,
-        approach(loss, params, train),
-        train,
-        loss=loss,
-        num_updates=NEWTON_UPDATES,
-        optimizer=newton(hessian),
-    )
+    found = polish(loss, approach(loss, params, train), hessian, train)
     return {
         "theta": parameters.flatten_params(found.params),
         "loss": found.loss[found.best],
@@ -219,14 +233,7 @@ def _repeat(
     """Tune on other drives."""
     key = jax.random.fold_in(jax.random.key(seed), 1 + number)
     drives = calibration_drives.drives(key, HURT, num_trials=PART)
-    found = fitting.tune(
-        MODEL,
-        params,
-        drives,
-        loss=loss,
-        num_updates=NEWTON_UPDATES,
-        optimizer=newton(hessian),
-    )
+    found = polish(loss, params, hessian, drives)
     return {"theta": parameters.flatten_params(found.params)}
 
 

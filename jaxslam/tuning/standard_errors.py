@@ -18,7 +18,9 @@ J = H, and C = H^-1 / B, the inverse Fisher information.
 
 Along an eigenvector v of H, with eigenvalue c, the variance is v^T C v = (v^T J v / B) / c^2. The
 data determine the direction if c > 0 and this is below 1: a standard error of theta below 1, a
-factor of e in a standard deviation. H is inverted on the determined directions only.
+factor of e in a standard deviation. H is inverted on the determined directions only. Along the
+others the variance is 1 or more, and counts as 1: a parameter that has a part in one has no smaller
+standard error than that part.
 
 A prior with precision P, a diagonal matrix, counts as w = 1 / (B T) of the loss, with T steps:
 
@@ -59,7 +61,8 @@ class StandardErrors(NamedTuple):
         names: (P,) names of the parameters.
         relative: (P,) standard errors of theta: of the logarithm of a positive parameter, so 0.1 is
             ten percent; NaN where frozen, inf where not determined.
-        covariance: (P, P) of theta in the determined directions; zero where frozen.
+        covariance: (P, P) of theta, at least, as that of undetermined directions counts as 1; zero
+            where frozen.
         identifiable: (P,) bool; False where frozen.
         warnings: Messages about free parameters that are not identifiable, and where the loss has
             no minimum; empty if all is well.
@@ -197,13 +200,15 @@ def _covariance(
         precision: (F,) w P of the priors; all zero for none.
         total: 1 / w.
     """
-    inverse, unknown = _invert_determined(hessian, outer, count)
+    inverse, undetermined = _invert_determined(hessian, outer, count)
+    unknown = np.sum(undetermined**2, axis=1)
     if precision.any():
         curvature, direction = np.linalg.eigh(hessian)  # the noise of H makes some negative
         hessian = direction * np.maximum(curvature, 0.0) @ direction.T + np.diag(precision)
         outer = outer + max(count, 1) * np.diag(precision) / total
-        inverse = _invert_determined(hessian, outer, count)[0]
-    return inverse @ outer @ inverse / max(count, 1), unknown
+        inverse, undetermined = _invert_determined(hessian, outer, count)
+    determined = inverse @ outer @ inverse / max(count, 1)
+    return determined + undetermined @ undetermined.T, unknown
 
 
 def _invert_determined(
@@ -217,15 +222,14 @@ def _invert_determined(
         count: B, the episodes that count.
 
     Returns:
-        The pseudo-inverse (F, F), and each parameter's squared component (F,) in the undetermined
-        directions, from 0 to 1.
+        The pseudo-inverse (F, F), and the undetermined directions (F, K).
     """
     curvature, direction = np.linalg.eigh(hessian)
     gradient_variance = np.einsum("ik,ij,jk->k", direction, outer, direction) / max(count, 1)
     determined = (curvature > 0.0) & (gradient_variance < curvature**2)
     kept = direction[:, determined]
     inverse = kept / curvature[determined] @ kept.T
-    return inverse, np.sum(direction[:, ~determined] ** 2, axis=1)
+    return inverse, direction[:, ~determined]
 
 
 def _errors(

@@ -88,6 +88,31 @@ def test_a_prior_alone_is_the_standard_error_where_the_data_say_nothing():
     np.testing.assert_allclose(np.sqrt(found.covariance[0, 0]), 0.03 / 0.5, rtol=1e-6)
 
 
+def test_a_number_with_a_part_in_what_is_not_determined_has_that_as_its_error():
+    """The data determine mean + 0.2 other; (-0.2, 1) changes nothing, and may change by 1."""
+
+    def of_sum(params, state, now):
+        return step(params | {"mean": params["mean"] + 0.2 * params["other"]}, state, now)
+
+    y, transforms = DATA["y"], TRANSFORMS | {"mean": real(1.0), "other": real(1.0)}
+    params = {"mean": np.array(y.mean()), "other": np.array(0.0), "std": np.array(y.std())}
+    found = standard_errors.standard_errors(
+        Model(init, of_sum), params, DATA, transforms=transforms
+    )
+    assert found.identifiable.tolist() == [True, False, True]
+    errors = found.of_params
+    of_means = y.mean(axis=1).std() / np.sqrt(B)
+    np.testing.assert_allclose(
+        errors["mean"] ** 2, (of_means / 1.04) ** 2 + 0.2**2 / 1.04, rtol=1e-2
+    )
+    of_sum_too = np.array([1.0, 0.2]) @ found.covariance[:2, :2] @ np.array([1.0, 0.2])
+    np.testing.assert_allclose(np.sqrt(of_sum_too), of_means, rtol=1e-2)
+    known = standard_errors.standard_errors(
+        Model(init, of_sum), params, DATA, transforms=transforms, frozen=("other",)
+    )
+    np.testing.assert_allclose(known.of_params["mean"], of_means, rtol=2e-3)
+
+
 def test_a_bounded_parameter_stays_within_its_bounds():
     """The likelihood wants 1.5; the bound is 1."""
     found = tuned(transforms=TRANSFORMS | {"mean": bounded(-1.0, 1.0)}, num_updates=40)

@@ -10,7 +10,6 @@ from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
 from jaxslam.simulation.ray_casting import add_range_noise as add_range_noise
 from jaxslam.simulation.ray_casting import cast as cast
 from jaxslam.simulation.robot import Robot as Robot
-from jaxslam.simulation.scanner_presets import preset as scanner_preset
 from jaxslam.simulation.scanners import Scanner as Scanner
 from jaxslam.simulation.trials import replay_trial as replay_trial
 from jaxslam.simulation.trials import run_trials as run_trials

@@ -89,9 +89,8 @@ def num_scans_of_drive(robot: Robot, path: Any) -> int:
     """
     points = arguments.as_path(path, None)
     # Odometry is looked at, at each scan: that of the robot itself.
-    plain = {"nominal_mount": (0.0, 0.0, 0.0), "odometry_rate": 0.0}
-    quiet = {"encoder_noise": 0.0, "steering_noise": 0.0, "slip_noise": (0.0, 0.0, 0.0)}
-    robot = arguments.as_robot(robot)._replace(**plain, **quiet)
+    robot = arguments.as_robot(robot)._replace(nominal_mount=(0.0, 0.0, 0.0), odometry_rate=0.0)
+    robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=(0.0, 0.0, 0.0))
     upper_bound = 40 + int(4 * _least_motions(robot, np.asarray(points)))
     simulated = jax.jit(partial(drive, num_scans=upper_bound), static_argnums=1)
     _, odometry = simulated(jax.random.key(0), robot, points)
@@ -187,6 +186,6 @@ def _scan(
         factors = jnp.exp(noise_by_incidence * ray_casting.incidence(lidar, world, pose))
     if scanner is None:
         return ray_casting.add_range_noise(key, lidar, scan, factors)
-    std = scanner.range_std(scan.ranges) * (1.0 if factors is None else factors)
+    std = jnp.asarray(scanner.range_std(scan.ranges)) * (1.0 if factors is None else factors)
     unit = lidar._replace(range_std=1.0)
     return scanners.digitise(scanner, ray_casting.add_range_noise(key, unit, scan, std))

@@ -101,9 +101,7 @@ def _twist_increment(ahead_left: Array, turn: Array) -> Array:
     return jnp.append(x * on_circle + y * left, turn)
 
 
-def _ackermann(
-    robot: Robot, draws: Array, ahead_left: Array, turn: Array
-) -> tuple[Array, Array]:
+def _ackermann(robot: Robot, draws: Array, ahead_left: Array, turn: Array) -> tuple[Array, Array]:
     """True motion (N, 2) [m] and turn (N,) [rad] of the parts of an Ackermann robot's motion."""
     distance = ahead_left[0]
     moves = distance != 0.0
@@ -119,9 +117,7 @@ def _ackermann(
     return moved, rolled * steered / base + swing * draws[:, 1]
 
 
-def _holonomic(
-    robot: Robot, draws: Array, ahead_left: Array, turn: Array
-) -> tuple[Array, Array]:
+def _holonomic(robot: Robot, draws: Array, ahead_left: Array, turn: Array) -> tuple[Array, Array]:
     """True motion (N, 2) [m] and turn (N,) [rad] of the parts of a holonomic robot's motion."""
     scale = robot.wheel_scales[0]
     true, turned = scale * ahead_left, scale / robot.wheel_base_scale * turn

@@ -69,7 +69,9 @@ _PRESETS = (
         range_max=12.0,  # white objects [A1]
         precision=pieces((0.0, 0.0, 0.01)),  # < 1 % of the distance, all distances [A1]
         range_resolution=0.00025,  # quarters of a millimetre [R]
-        notes=("its data sheet gives a distance resolution, which is taken for its precision",),
+        error_notes=(
+            "its data sheet gives a distance resolution, which is taken for its precision",
+        ),
     ),
     Scanner(
         "RPLidar A2",
@@ -79,7 +81,7 @@ _PRESETS = (
         range_max=12.0,  # A2M8 from R4 on [A2]
         precision=pieces((0.0, 0.0, 0.01)),  # 1 % [C]
         range_resolution=0.00025,  # quarters of a millimetre [R]
-        notes=("its error, 1 % of the distance, is from a table by users",),
+        error_notes=("its error, 1 % of the distance, is from a table by users",),
     ),
     Scanner(
         "RPLidar S2",
@@ -100,10 +102,8 @@ _PRESETS = (
         range_noise=pieces((0.0, 0.010, 0.0)),  # typical standard deviation, 0.3 to 12 m [L]
         accuracy=pieces((0.0, 0.045, 0.0)),  # +-45 mm of the mean of 100, 0.3 to 12 m [L]
         range_resolution=0.015,  # [L]
-        notes=(
-            "its noise is given from 0.3 m on, and taken below, too",
-            "its table gives 1 degree, and 4500 Hz, which are 0.8 degrees at 10 Hz",
-        ),
+        notes=("its table gives 1 degree, and 4500 Hz, which are 0.8 degrees at 10 Hz",),
+        error_notes=("its noise is given from 0.3 m on, and taken below, too",),
     ),
     Scanner(
         "URG-04LX",
@@ -115,7 +115,7 @@ _PRESETS = (
         range_max=5.6,  # [S]
         accuracy=pieces((0.06, 0.010, 0.0), (1.0, 0.0, 0.01)),  # +-10 mm, then 1 % to 4.095 m [P4]
         range_resolution=0.001,  # millimetres [S]
-        notes=("its accuracy is given from 0.06 to 4.095 m, and taken outside of that, too",),
+        error_notes=("its accuracy is given from 0.06 to 4.095 m, and taken outside of that, too",),
     ),
     Scanner(
         "UTM-30LX",
@@ -127,7 +127,7 @@ _PRESETS = (
         range_max=30.0,  # [P30]
         range_noise=pieces((0.1, 0.010, 0.0), (10.0, 0.030, 0.0)),  # sigma < 10, < 30 mm [P30]
         range_resolution=0.001,  # millimetres [S]
-        notes=("its noise is given as a bound of the standard deviation, which is taken",),
+        error_notes=("its noise is given as a bound of the standard deviation, which is taken",),
     ),
     Scanner(
         "LMS-200",
@@ -151,7 +151,7 @@ _PRESETS = (
         range_noise=pieces((0.0, 0.020, 0.0)),  # statistical error, 1 sigma [T2]
         accuracy=pieces((0.0, 0.060, 0.0)),  # systematic error +-60 mm [T2]
         range_resolution=0.001,  # millimetres [UT]
-        notes=("its errors are those of TiM55x and TiM56x",),
+        error_notes=("its errors are those of TiM55x and TiM56x",),
     ),
     Scanner(
         "S300",

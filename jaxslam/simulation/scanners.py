@@ -65,6 +65,7 @@ class Scanner(NamedTuple):
         beam_divergence: [rad] full angle by which a beam widens.
         beam_width: [m] width of a beam where it leaves the scanner.
         notes: What was assumed or chosen where sources say nothing or disagree.
+        error_notes: Likewise, of its errors.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Scanner(NamedTuple):
     beam_divergence: float | None = None
     beam_width: float | None = None
     notes: tuple[str, ...] = ()
+    error_notes: tuple[str, ...] = ()
 
     @property
     def full_circle(self) -> bool:
@@ -106,14 +108,15 @@ class Scanner(NamedTuple):
 
     def assumptions(self) -> tuple[str, ...]:
         """What is simulated although no source says so, in words."""
+        said = *self.error_notes, *self.notes
         if self.range_noise is not None:
-            return self.notes
+            return said
         given = "precision" if self.precision is not None else "accuracy"
         if self.precision is None and self.accuracy is None:
             assumed = f"{1000 * DEFAULT_STD:g} mm is assumed"
         else:
             assumed = f"a third of its {given} is assumed"
-        return (f"no standard deviation of its ranges is known: {assumed}", *self.notes)
+        return (f"no standard deviation of its ranges is known: {assumed}", *said)
 
     def range_std(self, ranges: AnyArray) -> AnyArray:
         """Standard deviations (...) [m] of true ranges (...) [m]; NumPy or JAX as given."""

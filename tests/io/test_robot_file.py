@@ -421,7 +421,7 @@ def test_drives_are_refused_by_what_they_lack(refused, text, old, new, message):
         (
             "8 mm + 0.5 %",
             "8",
-            ": scanner.range_noise: '8' has no unit; units are m, cm, cm",
+            ": scanner.range_noise: '8' has no unit; units are m, cm",
         ),
         (
             "8 mm + 0.5 %",

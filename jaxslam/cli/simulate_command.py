@@ -17,14 +17,13 @@ from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation import log_errors, summary
-from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
-from jaxslam.io import tum
+from jaxslam.io import robot_file, tum
 from jaxslam.io.output import folder
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.simulation import drives, path_following, worlds
+from jaxslam.simulation import drives, kinematics, path_following, worlds
 from jaxslam.simulation import trials as trials_module
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
@@ -35,6 +34,7 @@ def simulate(
     trials: int = 100,
     seed: int = 0,
     noise: OptionalFile = None,
+    robot: OptionalFile = None,
     landmarks: Literal["all", "junctions"] = "all",
     labels: Literal["segments", "codes"] = "segments",
     out: OutFolder = Path("out"),
@@ -50,6 +50,8 @@ def simulate(
         seed: Random seed of the odometry and range noise.
         noise: File of the noise parameters of the filter (Q and R); by default those of the
             simulated robot.
+        robot: File of the robot, TOML or JSON: scanner, drive, noise, limits, mount; by default it
+            has two wheels 0.4 m apart and 361 beams ahead. `jaxslam.io.robot_file` documents it.
         landmarks: Landmark types: all, or only the junctions of the Voronoi diagram (the paper's
             nodes).
         labels: Labels of occupied cells in the Voronoi expansion: straight wall segments, or the
@@ -65,18 +67,19 @@ def simulate(
     config = Config(frontend=FrontendConfig(labels=labels))
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
-    robot = Robot()
-    params = read_params(noise, NoiseParams.for_simulated_robot(*robot[:2]))
+    driven, config = _robot(robot, config)
+    params = read_params(noise, kinematics.noise_params(driven))
     key = jax.random.key(seed)
     with folder(out) as out_dir:
         enable_caches()
-        num_scans = drives.num_scans_of_drive(robot, path)
+        with name_errors("--robot"):
+            num_scans = drives.num_scans_of_drive(driven, path)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,
                 config,
                 params,
-                robot,
+                driven,
                 walls,
                 path,
                 num_trials=trials,
@@ -90,7 +93,7 @@ def simulate(
             "seconds": seconds,
         }
         true_poses, result = trials_module.replay_trial(
-            key, config, params, robot, walls, path, trial=0, num_scans=num_scans
+            key, config, params, driven, walls, path, trial=0, num_scans=num_scans
         )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)
@@ -100,6 +103,18 @@ def simulate(
         error = log_errors.pose_errors(result.poses, truth)
         report.draw(out_dir, config, result, trajectories, error, world=walls)
     summaries.print_summary(numbers, f"{trials} trials of {num_scans} scans, world {world}", out)
+
+
+def _robot(path: Path | None, config: Config) -> tuple[Robot, Config]:
+    """The robot of a file, printed in a line, or the default one; and what it is seen with."""
+    if path is None:
+        return Robot(), config
+    found = robot_file.read(path)
+    print(found.describe())
+    for note in found.notes:
+        print(f"  {note}")
+    lidar = found.robot.scanner.lidar() if found.robot.scanner else config.frontend.lidar
+    return found.robot, Config.for_lidar(lidar, frontend=config.frontend, filter=config.filter)
 
 
 def _collect(groups: Iterable[TrialResult], num_trials: int) -> TrialResult:

@@ -10,13 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.arguments import as_float
+from jaxslam.core.scan import Lidar
 from jaxslam.core.types import Array
 from jaxslam.simulation import worlds
+from jaxslam.simulation.kinematics import KINEMATICS, turning_radius
 from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW, densify
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.scanners import Scanner, check_scanner
 from jaxslam.simulation.worlds import World
 
 MIN_PATH_POINTS = 6  # the first and the sixth give the direction in which the drive starts
+MAX_TURN = np.pi / 2  # [rad] between two scans; where it is more, a path is not followed
 MAX_PATH_GAP = 1.0  # [m] between points of a path; of sparser ones the robot cuts the corners
 
 
@@ -37,29 +41,101 @@ def as_robot(robot: Any) -> Robot:
     if not isinstance(robot, Robot):
         raise ValueError(f"robot is {type(robot).__name__}, not Robot")
     robot = Robot(*(_plain(*field) for field in robot._asdict().items()))
-    for name in ("wheel_base", "wheel_base_scale", "scan_period"):
+    for name in ("wheel_base", "wheel_base_scale", "scan_period", "max_speed", "max_turn_rate"):
         if not 0.0 < getattr(robot, name) < np.inf:
             raise ValueError(f"robot.{name} is {getattr(robot, name)}, not above 0")
-    if not 0.0 <= robot.encoder_noise < np.inf:
-        raise ValueError(f"robot.encoder_noise is {robot.encoder_noise}, not 0 or more")
+    for name in ("encoder_noise", "steering_noise", "odometry_rate", "radius"):
+        if not 0.0 <= getattr(robot, name) < np.inf:
+            raise ValueError(f"robot.{name} is {getattr(robot, name)}, not 0 or more")
     if not all(0.0 < scale < np.inf for scale in robot.wheel_scales):
         raise ValueError(f"robot.wheel_scales is {robot.wheel_scales}, not two numbers above 0")
-    if not np.isfinite([*robot.mount, robot.time_offset]).all():
-        name = "time_offset" if np.isfinite(robot.mount).all() else "mount"
-        raise ValueError(f"robot.{name} is {getattr(robot, name)}, not finite")
+    if not all(0.0 <= noise < np.inf for noise in robot.slip_noise):
+        raise ValueError(f"robot.slip_noise is {robot.slip_noise}, not three numbers of 0 or more")
+    for name in ("mount", "nominal_mount", "time_offset", "steering_offset"):
+        if not np.isfinite(getattr(robot, name)).all():
+            raise ValueError(f"robot.{name} is {getattr(robot, name)}, not finite")
+    _check_kinematics(robot)
+    step, turn = robot.max_speed * robot.scan_period, robot.max_turn_rate * robot.scan_period
+    if step > LOOKAHEAD or turn > MAX_TURN:
+        raise ValueError(
+            f"robot moves {step:.2f} m and turns {turn:.2f} rad from scan to scan, by max_speed, "
+            f"max_turn_rate and scan_period; at most {LOOKAHEAD} m and {MAX_TURN:.2f} rad: let it "
+            "drive slower, or scan more often"
+        )
+    if robot.scanner is not None:
+        check_scanner(robot.scanner)
     return robot
+
+
+def _check_kinematics(robot: Robot) -> None:
+    """Raise ValueError unless a robot, whose numbers are possible, has what its drive needs."""
+    drive = robot.kinematics
+    if drive not in KINEMATICS:
+        raise ValueError(f"robot.kinematics is {drive!r}, not one of {', '.join(KINEMATICS)}")
+    if drive != "differential" and robot.wheel_scales[0] != robot.wheel_scales[1]:
+        raise ValueError(
+            f"robot.wheel_scales is {robot.wheel_scales}; of a drive that is {drive} both are the "
+            "same number"
+        )
+    own = {
+        "ackermann": ("max_steering", "min_turning_radius", "steering_noise", "steering_offset"),
+        "holonomic": ("slip_noise",),
+    }
+    for other, names in own.items():
+        for name in names if other != drive else ():
+            if getattr(robot, name) != Robot._field_defaults[name]:
+                raise ValueError(
+                    f"robot.{name} is {getattr(robot, name)}: it is of a drive that is {other}, "
+                    f"and this one is {drive}"
+                )
+    if drive != "ackermann":
+        return
+    if not (0.0 <= robot.max_steering < np.pi / 2 and 0.0 <= robot.min_turning_radius < np.inf):
+        raise ValueError(
+            f"robot.max_steering is {robot.max_steering} and robot.min_turning_radius "
+            f"{robot.min_turning_radius}, not in [0, pi / 2) and 0 or more"
+        )
+    if not turning_radius(robot) > 0.0:
+        raise ValueError(
+            "robot.max_steering and robot.min_turning_radius are 0; one of them bounds the "
+            "curvature of a drive that is ackermann"
+        )
+    bound = np.arctan(robot.wheel_base / turning_radius(robot))
+    if abs(robot.steering_offset) + bound >= np.pi / 2:
+        raise ValueError(
+            f"robot.steering_offset is {robot.steering_offset}; with the largest steering angle, "
+            f"{bound:.3f}, it is pi / 2 or more"
+        )
+
+
+def check_lidar_of(robot: Robot, lidar: Lidar) -> None:
+    """Raise ValueError unless the configuration's scanner is that of the robot, if it has one."""
+    if robot.scanner is None:
+        return
+    own = robot.scanner.lidar()
+    for name, ours, theirs in zip(Lidar._fields, own, lidar, strict=True):
+        if name != "range_std" and not np.isclose(ours, theirs, rtol=1e-6, atol=1e-9):
+            raise ValueError(
+                f"config.frontend.lidar.{name} is {theirs}, and that of robot.scanner is {ours}; "
+                "make the configuration with Config.for_lidar(robot.scanner.lidar())"
+            )
 
 
 def _plain(name: str, value: Any) -> Any:
     """A field of a robot as a float, or as a tuple of floats where the default is one."""
+    if name in ("kinematics", "scanner"):
+        wanted = str if name == "kinematics" else Scanner
+        if not isinstance(value, wanted) and not (name == "scanner" and value is None):
+            raise ValueError(f"robot.{name} is {type(value).__name__}, not {wanted.__name__}")
+        return value
     shape = np.shape(Robot._field_defaults[name])
     try:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
         numbers = None
     if numbers is None or numbers.shape != shape:
-        wanted = f"{shape[0]} numbers" if shape else "a number"
-        raise ValueError(f"robot.{name} is {value!r}, not {wanted}")
+        wanted_form = f"{shape[0]} numbers" if shape else "a number"
+        raise ValueError(f"robot.{name} is {value!r}, not {wanted_form}")
     return tuple(numbers.tolist()) if shape else float(numbers)
 
 

@@ -17,11 +17,13 @@ from jaxslam.core.se2 import compose
 from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
-from jaxslam.simulation import arguments, path_following, ray_casting
-from jaxslam.simulation.robot import Robot, true_increment
+from jaxslam.simulation import arguments, kinematics, ray_casting, scanners
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.scanners import Scanner
 from jaxslam.simulation.worlds import World
 
 SUBSTEPS = 4  # parts of the motion between two scans with encoder noise of their own
+MAX_DEPARTURE = 0.5  # [m] from its path, of a robot that cannot turn on the spot
 
 
 def start_pose(path: Array) -> Array:
@@ -43,25 +45,27 @@ def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array
     Args:
         key: Of the encoder noise.
         robot: With its encoder noise and systematic errors.
-        path: (N, 2) [m, world] of the point between its wheels.
+        path: (N, 2) [m, world] of the origin of its frame.
         num_scans: T, number of scans.
 
     Returns:
         True poses (T, 3) [m, m, rad] of the scanner in the world, and increments (T, 3) of the
-        robot as odometry reports them, zero at the first.
+        robot, or of the scanner at `robot.nominal_mount`, as odometry reports them, zero at the
+        first.
     """
     first = start_pose(path)
-    draws = jax.random.normal(key, (num_scans - 1, SUBSTEPS, 2), path.dtype)
+    shape = num_scans - 1, SUBSTEPS, kinematics.num_draws(robot)
+    draws = jax.random.normal(key, shape, path.dtype)
     late = robot.time_offset / robot.scan_period  # [scans]
     whole, part = math.floor(late), late - math.floor(late)
 
     def body(carry: tuple[Array, Array], draw: Array) -> tuple[tuple[Array, Array], Any]:
         pose, path_index = carry
-        odometry, path_index = path_following.pure_pursuit(path, path_index, pose)
+        odometry, path_index = kinematics.next_motion(robot, path, path_index, pose)
         between = pose
         if part:
-            between = compose(pose, true_increment(robot, draw, odometry, part=part))
-        pose = compose(pose, true_increment(robot, draw, odometry))
+            between = compose(pose, kinematics.true_motion(robot, draw, odometry, part=part))
+        pose = compose(pose, kinematics.true_motion(robot, draw, odometry))
         return (pose, path_index), (pose, odometry, between)
 
     _, (poses, odometry, between) = lax.scan(body, (first, jnp.int32(0)), draws)
@@ -70,29 +74,53 @@ def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array
         at = np.arange(num_scans) + whole
         poses = jnp.concatenate([between, poses[-1:]])[np.clip(at, 0, num_scans - 1)]
         poses = jnp.where((at < 0)[:, None], first[None], poses)
-    if robot.mount != (0.0, 0.0, 0.0):
-        poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(robot.mount, path.dtype))
-    return poses, jnp.pad(odometry, ((1, 0), (0, 0)))
+    for mount in (robot.nominal_mount, robot.mount):
+        if mount != (0.0, 0.0, 0.0):
+            poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(mount, path.dtype))
+    return poses, kinematics.report_odometry(robot, jnp.pad(odometry, ((1, 0), (0, 0))))
 
 
 def num_scans_of_drive(robot: Robot, path: Any) -> int:
     """Number of scans on a noise-free drive to the end of a path (N, 2).
 
     Raises:
-        ValueError: The robot or the path is not possible, or the robot does not arrive.
+        ValueError: The robot or the path is not possible, the robot does not arrive, or it cannot
+            turn on the spot and leaves the path.
     """
     points = arguments.as_path(path, None)
-    noise_free = arguments.as_robot(robot)._replace(encoder_noise=0.0)
-    upper_bound = 40 + int(4 * np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)) / 0.3)
+    # Odometry is looked at, at each scan: that of the robot itself.
+    robot = arguments.as_robot(robot)._replace(nominal_mount=(0.0, 0.0, 0.0), odometry_rate=0.0)
+    robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=(0.0, 0.0, 0.0))
+    upper_bound = 40 + int(4 * _least_motions(robot, np.asarray(points)))
     simulated = jax.jit(partial(drive, num_scans=upper_bound), static_argnums=1)
-    _, odometry = simulated(jax.random.key(0), noise_free, points)
+    _, odometry = simulated(jax.random.key(0), robot, points)
     moving = np.abs(np.asarray(odometry)[1:]).sum(axis=1) > 0
     if moving.all():
         raise ValueError(
             f"robot does not arrive at the end of the path in {upper_bound} scans; its "
             f"wheel_scales are {robot.wheel_scales}, its wheel_base_scale {robot.wheel_base_scale}"
         )
+    if kinematics.turning_radius(robot):
+        there = robot._replace(mount=(0.0, 0.0, 0.0), time_offset=0.0)
+        poses, _ = simulated(jax.random.key(0), there, points)
+        away = np.asarray(poses)[: 1 + int(moving.sum()), None, :2] - np.asarray(points)[None]
+        departure = np.hypot(away[..., 0], away[..., 1]).min(axis=1).max()
+        if departure > MAX_DEPARTURE:
+            raise ValueError(
+                f"robot leaves the path by {departure:.2f} m, at most {MAX_DEPARTURE} m are "
+                f"driven: its turning radius is {kinematics.turning_radius(robot):.2f} m; give a "
+                "path with wider bends"
+            )
     return 1 + int(moving.sum())
+
+
+def _least_motions(robot: Robot, path: np.ndarray) -> float:
+    """Motions between scans that the length of a path (N, 2), or its bends, take at least."""
+    along = np.diff(path, axis=0)
+    legs = along[np.any(along != 0.0, axis=1)]
+    turns = np.diff(np.unwrap(np.arctan2(legs[:, 1], legs[:, 0])))
+    steps = np.sum(np.linalg.norm(along, axis=1)) / (robot.max_speed * robot.scan_period)
+    return max(steps, np.abs(turns).sum() / (robot.max_turn_rate * robot.scan_period))
 
 
 def simulate_episode(
@@ -108,12 +136,18 @@ def simulate_episode(
     """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
 
     The standard deviation of a range has the factor exp(`noise_by_incidence` times the angle [rad]
-    between its beam and the normal of the wall).
+    between its beam and the normal of the wall). It is that of `robot.scanner`, if there is one.
     """
     truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
 
     def features(item: tuple[Array, Key]) -> Features:
-        scan = _scan(config.lidar, world, *item, noise_by_incidence=noise_by_incidence)
+        scan = _scan(
+            config.lidar,
+            world,
+            *item,
+            noise_by_incidence=noise_by_incidence,
+            scanner=robot.scanner,
+        )
         return extract.extract_features(config, scan)
 
     extracted = map_batches(features, (truth, scan_keys), batch_size=extract.SCAN_BATCH)
@@ -125,7 +159,8 @@ def simulate_scans(
 ) -> tuple[Array, Array, Scan]:
     """True poses (T, 3), odometry increments (T, 3) and scans [T] of `simulate_episode`."""
     truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
-    return truth, odometry, lax.map(lambda x: _scan(lidar, world, *x), (truth, scan_keys))
+    scan = partial(_scan, lidar, world, scanner=robot.scanner)
+    return truth, odometry, lax.map(lambda x: scan(*x), (truth, scan_keys))
 
 
 def _drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array, Array, Key]:
@@ -136,10 +171,21 @@ def _drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Arra
 
 
 def _scan(
-    lidar: Lidar, world: World, pose: Array, key: Key, *, noise_by_incidence: float = 0.0
+    lidar: Lidar,
+    world: World,
+    pose: Array,
+    key: Key,
+    *,
+    noise_by_incidence: float = 0.0,
+    scanner: Scanner | None = None,
 ) -> Scan:
-    """Noisy scan of the world from a pose (3,)."""
+    """Noisy scan of the world from a pose (3,), with the errors of a scanner if there is one."""
+    scan = ray_casting.cast(lidar, world, pose)
     factors = None
     if noise_by_incidence != 0.0:
         factors = jnp.exp(noise_by_incidence * ray_casting.incidence(lidar, world, pose))
-    return ray_casting.add_range_noise(key, lidar, ray_casting.cast(lidar, world, pose), factors)
+    if scanner is None:
+        return ray_casting.add_range_noise(key, lidar, scan, factors)
+    std = jnp.asarray(scanner.range_std(scan.ranges)) * (1.0 if factors is None else factors)
+    unit = lidar._replace(range_std=1.0)
+    return scanners.digitise(scanner, ray_casting.add_range_noise(key, unit, scan, std))

@@ -66,6 +66,7 @@ def pure_pursuit(
     lookahead: float = LOOKAHEAD,
     max_step: float = 0.3,
     max_turn: float = 0.2,
+    min_radius: float = 0.0,
 ) -> tuple[Array, Array]:
     """Motion to make between two scans to follow a path by pure pursuit.
 
@@ -86,6 +87,9 @@ def pure_pursuit(
         lookahead: [m] distance along the path from the nearest path point to the target.
         max_step: [m] largest length of the motion.
         max_turn: [rad] largest change of heading of the motion.
+        min_radius: [m] smallest radius of a circle that the robot can drive on; 0: it turns on the
+            spot. A robot that does not looks as far ahead, drives on the smallest circle where the
+            target asks for less, and has arrived when the end of the path is beside it.
 
     Returns:
         Motion (3,) [m, m, rad] in the frame of the robot, zero at the end of the path, and the
@@ -101,8 +105,13 @@ def pure_pursuit(
         raise ValueError(f"path is {path.shape}, not (N, 2)")
     if pose.shape != (3,):
         raise ValueError(f"pose is {pose.shape}, not (3,)")
-    nearest, target = _nearest_and_target(path, index, pose, lookahead)
+    nearest, target = _nearest_and_target(path, index, pose, max(lookahead, min_radius))
     distance, bearing = range_bearing(inverse_transform(pose, path[target]))
+    if min_radius > 0.0:
+        limits = max_step, max_turn, min_radius
+        passed = (target == path.shape[0] - 1) & (jnp.abs(bearing) > jnp.pi / 2)
+        done = passed & (distance < max(lookahead, min_radius)) | _at_end(path, target, distance)
+        return jnp.where(done, 0.0, _on_a_circle(distance, bearing, *limits)), nearest
 
     limited = jnp.clip(bearing, -TURN_ON_SPOT_ANGLE, TURN_ON_SPOT_ANGLE)
     curvature = 2 * jnp.sin(limited) / jnp.maximum(distance, GOAL_TOLERANCE)
@@ -110,10 +119,52 @@ def pure_pursuit(
     length = jnp.minimum(length, max_turn / jnp.maximum(jnp.abs(curvature), max_turn / max_step))
 
     on_the_spot = jnp.abs(bearing) > TURN_ON_SPOT_ANGLE
-    done = (target == path.shape[0] - 1) & (distance < GOAL_TOLERANCE)
+    done = _at_end(path, target, distance)
     length = jnp.where(done | on_the_spot, 0.0, length)
     rotation = jnp.where(on_the_spot, jnp.clip(bearing, -max_turn, max_turn), length * curvature)
     return arc_increment(length, jnp.where(done, 0.0, rotation)), nearest
+
+
+def _at_end(path: Array, target: Array, distance: Array) -> Array:
+    """Whether () the target is the end of the path, and reached."""
+    return (target == path.shape[0] - 1) & (distance < GOAL_TOLERANCE)
+
+
+def _on_a_circle(
+    distance: Array, bearing: Array, max_step: float, max_turn: float, min_radius: float
+) -> Array:
+    """Motion (3,) towards a target on a circle that starts ahead, of at least `min_radius` [m]."""
+    limited = jnp.clip(bearing, -jnp.pi / 2, jnp.pi / 2)
+    curvature = 2 * jnp.sin(limited) / jnp.maximum(distance, GOAL_TOLERANCE)
+    curvature = jnp.clip(curvature, -1 / min_radius, 1 / min_radius)
+    length = jnp.minimum(max_step, distance / jnp.sinc(limited / jnp.pi))
+    length = jnp.minimum(length, max_turn / jnp.maximum(jnp.abs(curvature), max_turn / max_step))
+    return arc_increment(length, length * curvature)
+
+
+def holonomic_pursuit(
+    path: Array, index: Array, pose: Array, *, max_step: float, max_turn: float
+) -> tuple[Array, Array]:
+    """Motion to make between two scans by a robot that drives in any direction.
+
+    Its chord points at the target of `pure_pursuit`; meanwhile the robot turns towards it.
+
+    Args:
+        path: (N, 2) points of the path [m, map frame].
+        index: () int32 index of the path point that was nearest at the last call, 0 at the first.
+        pose: (3,) [m, m, rad] of the robot, map frame.
+        max_step: [m] largest length of the motion.
+        max_turn: [rad] largest change of heading of the motion.
+
+    Returns:
+        As of `pure_pursuit`.
+    """
+    nearest, target = _nearest_and_target(path, index, pose, LOOKAHEAD)
+    ahead = inverse_transform(pose, path[target])
+    distance, bearing = range_bearing(ahead)
+    share = jnp.minimum(1.0, max_step / jnp.maximum(distance, GOAL_TOLERANCE))
+    motion = jnp.append(share * ahead, jnp.clip(bearing, -max_turn, max_turn))
+    return jnp.where(_at_end(path, target, distance), 0.0, motion), nearest
 
 
 def _nearest_and_target(

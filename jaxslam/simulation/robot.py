@@ -1,4 +1,7 @@
-"""A robot with two driven wheels: kinematics, encoder noise and systematic errors."""
+"""A robot: its kinematics, noise, systematic errors, limits and scanner; two driven wheels.
+
+The motion of the other robots is in `kinematics`.
+"""
 
 from typing import NamedTuple
 
@@ -9,23 +12,47 @@ import numpy as np
 from jaxslam.core.calibration import Calibration
 from jaxslam.core.se2 import compose, dot, unit_vector
 from jaxslam.core.types import Array
+from jaxslam.simulation.scanners import Scanner
 
 
 class Robot(NamedTuple):
-    """A differential-drive robot, the origin of its frame between the wheels; static under jit.
+    """A robot, the origin of its frame between the (rear) wheels; static under jit.
 
     Attributes:
-        wheel_base: [m] distance between the wheels.
+        wheel_base: [m] distance between the two wheels of a differential drive, between the axles
+            of an Ackermann drive, between opposite wheels of a holonomic one.
         encoder_noise: [m / sqrt(m)] standard deviation of a wheel's encoder over one metre; its
-            variance grows in proportion to the distance rolled.
-        wheel_scales: [-] true distance per distance that the encoder reads, left and right.
+            variance grows in proportion to the distance rolled. An Ackermann drive has one encoder
+            for both rear wheels.
+        wheel_scales: [-] true distance per distance that the encoder reads, left and right; the
+            same number twice where the drive is not differential.
         wheel_base_scale: [-] true distance between the wheels per `wheel_base`, which odometry
             assumes.
-        mount: [m, m, rad] pose of the scanner in the frame of the robot.
+        mount: [m, m, rad] pose of the scanner in the frame of `nominal_mount`: an error that the
+            robot's user does not know.
         time_offset: [s] by which the clock of the odometry is ahead: a scan with stamp t is taken
             where the odometry has the robot at t + time_offset.
-        scan_period: [s] from a scan to the next. A robot that follows a path moves by 0.3 m and
-            turns by 0.2 rad in it, at most: by default at 0.6 m/s and 0.4 rad/s.
+        scan_period: [s] from a scan to the next.
+        max_speed: [m/s] of a robot that follows a path.
+        max_turn_rate: [rad/s] likewise.
+        kinematics: `"differential"`, `"ackermann"` or `"holonomic"`.
+        max_steering: [rad] largest angle of the steered wheels, of an Ackermann drive; 0: only
+            `min_turning_radius` bounds it.
+        min_turning_radius: [m] of the middle of the rear axle, of an Ackermann drive; 0: only
+            `max_steering` bounds it.
+        steering_noise: [rad sqrt(m)] standard deviation of the mean error of the steering angle
+            over one metre; that of a distance falls with its root.
+        steering_offset: [rad] true steering angle where it reads 0.
+        slip_noise: [m / sqrt(m), m / sqrt(m), rad / sqrt(m)] standard deviations of ahead, left and
+            heading of a holonomic drive's odometry over one metre; that of the heading also grows
+            with what the wheels roll where it turns.
+        odometry_rate: [Hz] of the odometry, which is interpolated at the scans; 0: it is reported
+            with each scan.
+        nominal_mount: [m, m, rad] pose of the scanner in the frame of the robot as its user knows
+            it; odometry is reported for the scanner there.
+        radius: [m] of a circle around the origin that holds the robot; 0: not known.
+        scanner: The scanner; None: the `Lidar` of the configuration, with noise alike at all
+            ranges.
     """
 
     wheel_base: float = 0.4
@@ -35,9 +62,31 @@ class Robot(NamedTuple):
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_offset: float = 0.0
     scan_period: float = 0.5
+    max_speed: float = 0.6
+    max_turn_rate: float = 0.4
+    kinematics: str = "differential"
+    max_steering: float = 0.0
+    min_turning_radius: float = 0.0
+    steering_noise: float = 0.0
+    steering_offset: float = 0.0
+    slip_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    odometry_rate: float = 0.0
+    nominal_mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius: float = 0.0
+    scanner: Scanner | None = None
 
     def calibration(self) -> Calibration:
-        """The systematic errors, as `calibrate_odometry` removes them; NumPy arrays."""
+        """The systematic errors, as `calibrate_odometry` removes them; NumPy arrays.
+
+        Raises:
+            ValueError: The steering has an offset: no calibration makes its odometry exact, because
+                the error of the heading is not linear in distance and turn.
+        """
+        if self.steering_offset:
+            raise ValueError(
+                f"robot.steering_offset is {self.steering_offset}: it has no calibration; one is "
+                "defined for scales, mount and time offset"
+            )
         left, right = self.wheel_scales
         wheels = Calibration.of_wheels(
             left, right, self.wheel_base_scale, wheel_base=self.wheel_base

@@ -56,6 +56,7 @@ def _drive_of(
     arguments.check_key(key)
     check_config(config)
     robot, walls = arguments.as_robot(robot), arguments.as_world(world)
+    arguments.check_lidar_of(robot, config.frontend.lidar)
     points = arguments.as_path(path, world)
     if num_scans is None:
         return _Drive(robot, walls, points, num_scans_of_drive(robot, points))

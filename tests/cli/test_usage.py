@@ -82,7 +82,7 @@ def test_help_says_in_a_line_what_each_command_does(capsys):
 
 
 OPTIONS = {
-    "simulate": "--world --trials --seed --noise --landmarks --labels --out",
+    "simulate": "--world --trials --seed --noise --robot --landmarks --labels --out",
     "run": "--reference --relations --odometry --smooth --no-smooth --noise --map --scan-topic "
     "--odometry-topic --mount --upside-down --scan-frame --base-frame --odom-frame "
     "--angle-increment --pose-frame --scan --gif --rerun --strict --out",

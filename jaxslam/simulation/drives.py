@@ -88,28 +88,28 @@ def num_scans_of_drive(robot: Robot, path: Any) -> int:
             turn on the spot and leaves the path.
     """
     points = arguments.as_path(path, None)
-    # Odometry is looked at, at each scan: that of the robot itself.
-    robot = arguments.as_robot(robot)._replace(nominal_mount=(0.0, 0.0, 0.0), odometry_rate=0.0)
-    robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=(0.0, 0.0, 0.0))
+    # Neither where the scanner is nor its clock changes how the robot drives.
+    still = (0.0, 0.0, 0.0)
+    robot = arguments.as_robot(robot)._replace(mount=still, nominal_mount=still, time_offset=0.0)
+    robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=still)
+    robot = robot._replace(odometry_rate=0.0)
     upper_bound = 40 + int(4 * _least_motions(robot, np.asarray(points)))
     simulated = jax.jit(partial(drive, num_scans=upper_bound), static_argnums=1)
-    _, odometry = simulated(jax.random.key(0), robot, points)
+    poses, odometry = simulated(jax.random.key(0), robot, points)
     moving = np.abs(np.asarray(odometry)[1:]).sum(axis=1) > 0
     if moving.all():
         raise ValueError(
             f"robot does not arrive at the end of the path in {upper_bound} scans; its "
             f"wheel_scales are {robot.wheel_scales}, its wheel_base_scale {robot.wheel_base_scale}"
         )
-    if kinematics.turning_radius(robot):
-        there = robot._replace(mount=(0.0, 0.0, 0.0), time_offset=0.0)
-        poses, _ = simulated(jax.random.key(0), there, points)
-        away = np.asarray(poses)[: 1 + int(moving.sum()), None, :2] - np.asarray(points)[None]
-        departure = np.hypot(away[..., 0], away[..., 1]).min(axis=1).max()
+    radius = kinematics.turning_radius(robot)
+    if radius:
+        driven = np.asarray(poses)[: 1 + int(moving.sum()), :2]
+        departure = max(np.hypot(*(np.asarray(points) - at[None]).T).min() for at in driven)
         if departure > MAX_DEPARTURE:
             raise ValueError(
                 f"robot leaves the path by {departure:.2f} m, at most {MAX_DEPARTURE} m are "
-                f"driven: its turning radius is {kinematics.turning_radius(robot):.2f} m; give a "
-                "path with wider bends"
+                f"driven: its turning radius is {radius:.2f} m; give a path with wider bends"
             )
     return 1 + int(moving.sum())
 

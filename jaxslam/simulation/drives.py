@@ -17,6 +17,7 @@ from jaxslam.core.se2 import compose
 from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.lidar import to_scan
 from jaxslam.simulation import arguments, path_following, ray_casting
 from jaxslam.simulation.robot import Robot, true_increment
 from jaxslam.simulation.worlds import World
@@ -139,7 +140,8 @@ def _scan(
     lidar: Lidar, world: World, pose: Array, key: Key, *, noise_by_incidence: float = 0.0
 ) -> Scan:
     """Noisy scan of the world from a pose (3,)."""
-    factors = None
+    hits, factors = ray_casting.find_hits(lidar, world, pose), None
     if noise_by_incidence != 0.0:
-        factors = jnp.exp(noise_by_incidence * ray_casting.incidence(lidar, world, pose))
-    return ray_casting.add_range_noise(key, lidar, ray_casting.cast(lidar, world, pose), factors)
+        angle = ray_casting.incidence(lidar, world, pose, hits=hits)
+        factors = jnp.exp(noise_by_incidence * angle)
+    return ray_casting.add_range_noise(key, lidar, to_scan(lidar, hits.distance), factors)

@@ -55,7 +55,8 @@ def _drive_of(
     """
     arguments.check_key(key)
     check_config(config)
-    robot, walls = arguments.as_robot(robot), arguments.as_world(world)
+    robot = arguments.as_robot(robot)
+    walls = arguments.as_world(world, config.frontend.lidar.range_max)
     points = arguments.as_path(path, world)
     if num_scans is None:
         return _Drive(robot, walls, points, num_scans_of_drive(robot, points))

@@ -1,5 +1,6 @@
 """Simulated worlds, robots, scans and drives, and Monte-Carlo trials of them."""
 
+from jaxslam.simulation.discs import Discs as Discs
 from jaxslam.simulation.drives import drive as drive
 from jaxslam.simulation.drives import num_scans_of_drive as num_scans_of_drive
 from jaxslam.simulation.drives import simulate_scans as simulate_scans
@@ -7,8 +8,11 @@ from jaxslam.simulation.floor_plans import floor_plan as floor_plan
 from jaxslam.simulation.kinematics import noise_params as noise_params
 from jaxslam.simulation.path_following import densify as densify
 from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
+from jaxslam.simulation.ray_casting import Hits as Hits
 from jaxslam.simulation.ray_casting import add_range_noise as add_range_noise
 from jaxslam.simulation.ray_casting import cast as cast
+from jaxslam.simulation.ray_casting import find_hits as find_hits
+from jaxslam.simulation.ray_casting import share_leaving as share_leaving
 from jaxslam.simulation.robot import Robot as Robot
 from jaxslam.simulation.scanners import Scanner as Scanner
 from jaxslam.simulation.trials import replay_trial as replay_trial
@@ -20,3 +24,4 @@ from jaxslam.simulation.worlds import World as World
 from jaxslam.simulation.worlds import named as named
 from jaxslam.simulation.worlds import scan_poses as scan_poses
 from jaxslam.simulation.worlds import waypoints as waypoints
+from jaxslam.simulation.worlds import with_index as with_index

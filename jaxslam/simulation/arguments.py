@@ -17,7 +17,7 @@ from jaxslam.simulation.kinematics import KINEMATICS, turning_radius
 from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW, densify
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.scanners import Scanner, check_scanner
-from jaxslam.simulation.worlds import World
+from jaxslam.simulation.worlds import World, with_index
 
 MIN_PATH_POINTS = 6  # the first and the sixth give the direction in which the drive starts
 MAX_TURN = np.pi / 2  # [rad] between two scans; where it is more, a path is not followed
@@ -139,14 +139,18 @@ def _plain(name: str, value: Any) -> Any:
     return tuple(numbers.tolist()) if shape else float(numbers)
 
 
-def as_world(world: Any) -> World:
-    """A world in JAX's precision, of its name or of walls.
+def as_world(world: Any, range_max: float) -> World:
+    """A world in JAX's precision, of its name or of walls; many walls with an index.
+
+    Args:
+        world: Its name, or its walls. An index that they have is made anew.
+        range_max: [m] of the scanner that will be there.
 
     Raises:
         ValueError: There is no world of this name, or the walls are not (S, 4) finite numbers.
     """
     if isinstance(world, str):
-        return World(jnp.asarray(worlds.named(world).walls, float))
+        return with_index(World(jnp.asarray(worlds.named(world).walls, float)), range_max)
     if not isinstance(world, World):
         raise ValueError(
             f"world is {type(world).__name__}, not World or one of the names "
@@ -155,7 +159,7 @@ def as_world(world: Any) -> World:
     walls = as_float("world.walls", world.walls, ("S", 4))
     if not np.isfinite(walls).all():
         raise ValueError("world.walls holds numbers that are not finite")
-    return World(walls)
+    return with_index(World(walls), range_max)
 
 
 def as_path(path: Any, world: Any) -> Array:

@@ -17,6 +17,7 @@ from jaxslam.core.se2 import compose
 from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.lidar import to_scan
 from jaxslam.simulation import arguments, kinematics, ray_casting, scanners
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.scanners import Scanner
@@ -180,10 +181,11 @@ def _scan(
     scanner: Scanner | None = None,
 ) -> Scan:
     """Noisy scan of the world from a pose (3,), with the errors of a scanner if there is one."""
-    scan = ray_casting.cast(lidar, world, pose)
-    factors = None
+    hits, factors = ray_casting.find_hits(lidar, world, pose), None
+    scan = to_scan(lidar, hits.distance)
     if noise_by_incidence != 0.0:
-        factors = jnp.exp(noise_by_incidence * ray_casting.incidence(lidar, world, pose))
+        angle = ray_casting.incidence(lidar, world, pose, hits=hits)
+        factors = jnp.exp(noise_by_incidence * angle)
     if scanner is None:
         return ray_casting.add_range_noise(key, lidar, scan, factors)
     std = jnp.asarray(scanner.range_std(scan.ranges)) * (1.0 if factors is None else factors)

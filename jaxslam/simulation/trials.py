@@ -55,7 +55,8 @@ def _drive_of(
     """
     arguments.check_key(key)
     check_config(config)
-    robot, walls = arguments.as_robot(robot), arguments.as_world(world)
+    robot = arguments.as_robot(robot)
+    walls = arguments.as_world(world, config.frontend.lidar.range_max)
     arguments.check_lidar_of(robot, config.frontend.lidar)
     points = arguments.as_path(path, world)
     if num_scans is None:

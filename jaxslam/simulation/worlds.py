@@ -1,11 +1,17 @@
 """Simulated environments: those of the paper's figures, an office, and random floor plans."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.types import AnyArray
+from jaxslam.simulation.wall_index import WallIndex, index_walls
+
+UNINDEXED = 192  # walls; as many are tried in the time that an index takes
 
 T = TypeVar("T")
 Box = tuple[float, float, float, float]
@@ -20,9 +26,35 @@ class World(NamedTuple):
 
     Attributes:
         walls: (S, 4) [m] ends x1, y1, x2, y2, world frame.
+        index: Of the walls, for fast ray casting among many; None to try all of them.
     """
 
     walls: AnyArray
+    index: WallIndex | None = None
+
+
+def with_index(world: World, range_max: float) -> World:
+    """A world with an index of its walls, if they are more than `UNINDEXED`.
+
+    Args:
+        world: The walls; not traced. None of them may be moved later.
+        range_max: [m] range of the scanner.
+
+    Raises:
+        ValueError: Walls or range are not possible.
+    """
+    if len(world.walls) <= UNINDEXED:
+        return World(world.walls)
+    dtype = jnp.asarray(world.walls).dtype
+    walls = np.asarray(world.walls, float)
+    return World(world.walls, _indexed(walls.tobytes(), float(range_max), np.dtype(dtype)))
+
+
+@lru_cache(maxsize=4)
+def _indexed(walls: bytes, range_max: float, dtype: np.dtype) -> WallIndex:
+    """Index of walls, given as the bytes of their numbers, whose floats have a type."""
+    index = index_walls(np.frombuffer(walls).reshape(-1, 4), range_max)
+    return jax.tree.map(lambda x: jnp.asarray(x, None if x.dtype == np.int32 else dtype), index)
 
 
 def covers(boxes: Sequence[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:

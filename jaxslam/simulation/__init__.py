@@ -6,8 +6,11 @@ from jaxslam.simulation.drives import num_scans_of_drive as num_scans_of_drive
 from jaxslam.simulation.drives import simulate_scans as simulate_scans
 from jaxslam.simulation.floor_plans import floor_plan as floor_plan
 from jaxslam.simulation.kinematics import noise_params as noise_params
+from jaxslam.simulation.life import Life as Life
+from jaxslam.simulation.life import life_in as life_in
 from jaxslam.simulation.path_following import densify as densify
 from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
+from jaxslam.simulation.range_errors import RangeErrors as RangeErrors
 from jaxslam.simulation.ray_casting import Hits as Hits
 from jaxslam.simulation.ray_casting import add_range_noise as add_range_noise
 from jaxslam.simulation.ray_casting import cast as cast
@@ -15,11 +18,13 @@ from jaxslam.simulation.ray_casting import find_hits as find_hits
 from jaxslam.simulation.ray_casting import share_leaving as share_leaving
 from jaxslam.simulation.robot import Robot as Robot
 from jaxslam.simulation.scanners import Scanner as Scanner
+from jaxslam.simulation.traffic import Traffic as Traffic
 from jaxslam.simulation.trials import replay_trial as replay_trial
 from jaxslam.simulation.trials import run_trials as run_trials
 from jaxslam.simulation.trials import simulate_episodes as simulate_episodes
 from jaxslam.simulation.trials import simulate_keys as simulate_keys
 from jaxslam.simulation.trials import trial_keys as trial_keys
+from jaxslam.simulation.wheel_faults import WheelFaults as WheelFaults
 from jaxslam.simulation.worlds import World as World
 from jaxslam.simulation.worlds import named as named
 from jaxslam.simulation.worlds import scan_poses as scan_poses

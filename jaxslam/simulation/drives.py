@@ -1,6 +1,7 @@
 """Simulated drives: a robot that follows a path, its odometry and its scans."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,12 +19,14 @@ from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import to_scan
-from jaxslam.simulation import arguments, kinematics, ray_casting, scanners
+from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
+from jaxslam.simulation.life import Events, Life, draw_events, scan_life
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.scanners import Scanner
 from jaxslam.simulation.worlds import World
 
 SUBSTEPS = 4  # parts of the motion between two scans with encoder noise of their own
+LIFE = 1  # number of the key of what goes wrong, of that of a drive
 MAX_DEPARTURE = 0.5  # [m] from its path, of a robot that cannot turn on the spot
 
 
@@ -38,7 +41,15 @@ def start_pose(path: Array) -> Array:
     return jnp.append(path[0], jnp.arctan2(along[1], along[0]))
 
 
-def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array, Array]:
+def drive(
+    key: Key,
+    robot: Robot,
+    path: Array,
+    *,
+    num_scans: int,
+    life: Life | None = None,
+    events: Events | None = None,
+) -> tuple[Array, Array]:
     """Drive along a path by pure pursuit, steered by the true pose of the robot.
 
     The robot stands still before the first scan and after the last one, by the odometry's clock.
@@ -48,6 +59,8 @@ def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array
         robot: With its encoder noise and systematic errors.
         path: (N, 2) [m, world] of the origin of its frame.
         num_scans: T, number of scans.
+        life: What may go wrong, with `events`; None: nothing.
+        events: What happens on this drive, by `life.draw_events`.
 
     Returns:
         True poses (T, 3) [m, m, rad] of the scanner in the world, and increments (T, 3) of the
@@ -60,16 +73,30 @@ def drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array
     late = robot.time_offset / robot.scan_period  # [scans]
     whole, part = math.floor(late), late - math.floor(late)
 
-    def body(carry: tuple[Array, Array], draw: Array) -> tuple[tuple[Array, Array], Any]:
+    def body(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], Any]:
         pose, path_index = carry
+        draw, slip, is_carried = now
+        if life is not None:
+            pose, path_index = wheel_faults.carry(life.wheels, is_carried, path, path_index, pose)
         odometry, path_index = kinematics.next_motion(robot, path, path_index, pose)
-        between = pose
-        if part:
-            between = compose(pose, kinematics.true_motion(robot, draw, odometry, part=part))
-        pose = compose(pose, kinematics.true_motion(robot, draw, odometry))
+
+        def moved(part: float) -> Array:
+            motion = kinematics.true_motion(robot, draw, odometry, part=part)
+            if life is not None and events is not None:
+                own = life.wheels, events.faults, slip, robot.wheel_base
+                motion = wheel_faults.slipped(*own, pose, motion)
+            return compose(pose, motion)
+
+        between = moved(part) if part else pose
+        pose = moved(1.0)
         return (pose, path_index), (pose, odometry, between)
 
-    _, (poses, odometry, between) = lax.scan(body, (first, jnp.int32(0)), draws)
+    slips, carried = None, None
+    if events is not None:
+        slips = events.faults.slip
+        carried = jnp.arange(num_scans - 1) == events.faults.carried_at
+    steps = draws, slips, carried
+    _, (poses, odometry, between) = lax.scan(body, (first, jnp.int32(0)), steps)
     poses = jnp.concatenate([first[None], poses])
     if late:
         at = np.arange(num_scans) + whole
@@ -133,42 +160,87 @@ def simulate_episode(
     *,
     num_scans: int,
     noise_by_incidence: float = 0.0,
+    life: Life | None = None,
 ) -> Episode:
     """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
 
     The standard deviation of a range has the factor exp(`noise_by_incidence` times the angle [rad]
     between its beam and the normal of the wall). It is that of `robot.scanner`, if there is one.
     """
-    truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
+    scan_of, items, odometry = _drive(
+        key,
+        config.lidar,
+        robot,
+        world,
+        path,
+        num_scans=num_scans,
+        noise_by_incidence=noise_by_incidence,
+        life=life,
+    )
 
-    def features(item: tuple[Array, Key]) -> Features:
-        scan = _scan(
-            config.lidar,
-            world,
-            *item,
-            noise_by_incidence=noise_by_incidence,
-            scanner=robot.scanner,
-        )
-        return extract.extract_features(config, scan)
+    def features(item: tuple) -> Features:
+        return extract.extract_features(config, scan_of(item))
 
-    extracted = map_batches(features, (truth, scan_keys), batch_size=extract.SCAN_BATCH)
-    return Episode(truth=truth, odometry=odometry, features=extracted)
+    extracted = map_batches(features, items, batch_size=extract.SCAN_BATCH)
+    return Episode(truth=items[0], odometry=odometry, features=extracted)
 
 
 def simulate_scans(
-    key: Key, lidar: Lidar, robot: Robot, world: World, path: Array, *, num_scans: int
+    key: Key,
+    lidar: Lidar,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    life: Life | None = None,
 ) -> tuple[Array, Array, Scan]:
     """True poses (T, 3), odometry increments (T, 3) and scans [T] of `simulate_episode`."""
-    truth, odometry, scan_keys = _drive(key, robot, path, num_scans=num_scans)
-    scan = partial(_scan, lidar, world, scanner=robot.scanner)
-    return truth, odometry, lax.map(lambda x: scan(*x), (truth, scan_keys))
+    scan_of, items, odometry = _drive(
+        key, lidar, robot, world, path, num_scans=num_scans, life=life
+    )
+    return items[0], odometry, lax.map(scan_of, items)
 
 
-def _drive(key: Key, robot: Robot, path: Array, *, num_scans: int) -> tuple[Array, Array, Key]:
-    """True poses (T, 3), odometry increments (T, 3), and a key (T,) for each scan."""
+def _drive(
+    key: Key,
+    lidar: Lidar,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+) -> tuple[Callable[[tuple], Scan], tuple, Array]:
+    """A drive whose scans are still to be made.
+
+    Returns:
+        A function that makes a scan of an item; the items [T], of which the first is the true pose
+        (T, 3); and odometry increments (T, 3).
+    """
     drive_key, scan_key = jax.random.split(key)
-    truth, odometry = drive(drive_key, robot, path, num_scans=num_scans)
-    return truth, odometry, jax.random.split(scan_key, num_scans)
+    keys = jax.random.split(scan_key, num_scans)
+    if life is None:
+        truth, odometry = drive(drive_key, robot, path, num_scans=num_scans)
+        scan = partial(
+            _scan, lidar, world, noise_by_incidence=noise_by_incidence, scanner=robot.scanner
+        )
+        return (lambda item: scan(*item)), (truth, keys), odometry
+
+    of_events, of_odometry, of_scans = jax.random.split(jax.random.fold_in(key, LIFE), 3)
+    events = draw_events(of_events, life, num_scans)
+    truth, odometry = drive(drive_key, robot, path, num_scans=num_scans, life=life, events=events)
+    odometry = wheel_faults.fail_odometry(of_odometry, life.wheels, odometry)
+    kept = wheel_faults.keeps_scan(of_scans, life.wheels, num_scans, truth.dtype)
+    times = robot.scan_period * jnp.arange(num_scans, dtype=truth.dtype)
+
+    def living(item: tuple) -> Scan:
+        pose, own, time, is_kept = item
+        scan = scan_life(own, lidar, robot.scanner, world, life, events, pose, time)
+        return to_scan(lidar, jnp.where(is_kept & scan.hit, scan.ranges, jnp.inf))
+
+    return living, (truth, keys, times, kept), odometry
 
 
 def _scan(

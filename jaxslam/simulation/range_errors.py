@@ -9,19 +9,21 @@ from jax import lax
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.types import Array, Key
 from jaxslam.frontend.lidar import to_scan
+from jaxslam.simulation import scanners
+from jaxslam.simulation.scanners import Scanner
 
 
 class RangeErrors(NamedTuple):
-    """Errors of ranges beside `Lidar.range_std`; numbers, traced under jit, none by default.
+    """Errors of ranges beside those of the scanner; numbers, traced under jit, none by default.
 
     Attributes:
-        std_per_range: [-] part of the standard deviation that grows in proportion to the range.
+        std_scale: [-] factor on the standard deviation of the scanner.
+        std_per_range: [-] further part of it that grows in proportion to the range.
         std_by_incidence: [1 / rad] by which the logarithm of the standard deviation grows with the
             angle between a beam and the normal of the wall.
         resolution: [m] step to which ranges are rounded, 0 for none.
         spot: [rad] angle that the spot of a beam covers: where it covers an edge the range is the
             mean over what it meets, weighted by the angle.
-        range_min: [m] nothing returns from nearer.
         missing: [-] probability that a beam does not return, whatever it meets.
         black: [-] share of the walls that are black.
         black_range: [m] from which a black wall that faces the scanner returns; from another
@@ -30,11 +32,11 @@ class RangeErrors(NamedTuple):
         glass_angle: [rad] incidence below which glass returns a beam.
     """
 
+    std_scale: Any = 1.0
     std_per_range: Any = 0.0
     std_by_incidence: Any = 0.0
     resolution: Any = 0.0
     spot: Any = 0.0
-    range_min: Any = 0.0
     missing: Any = 0.0
     black: Any = 0.0
     black_range: Any = 2.0
@@ -58,7 +60,14 @@ class Returns(NamedTuple):
     is_black: Array
 
 
-def measure(key: Key, lidar: Lidar, errors: RangeErrors, returns: Returns) -> Scan:
+def measure(
+    key: Key,
+    lidar: Lidar,
+    errors: RangeErrors,
+    returns: Returns,
+    *,
+    scanner: Scanner | None = None,
+) -> Scan:
     """Scan of what the beams meet.
 
     Gradients with respect to the noise are those of its reparametrisation; rounding counts as the
@@ -66,22 +75,25 @@ def measure(key: Key, lidar: Lidar, errors: RangeErrors, returns: Returns) -> Sc
 
     Args:
         key: Of all that is random.
-        lidar: The scanner; its `range_std` is the constant part of the noise.
+        lidar: The scanner as the front end knows it.
         errors: Of its ranges.
         returns: What its beams meet.
+        scanner: The scanner with its own noise, resolution and least range; None: those of `lidar`.
     """
     of_noise, of_edges, of_missing = jax.random.split(key, 3)
     ranges = mix_edges(of_edges, lidar, errors.spot, returns)
     has_return = jnp.isfinite(ranges)
     safe = jnp.where(has_return, ranges, lidar.range_max)
-    std = jnp.hypot(jnp.asarray(lidar.range_std, safe.dtype), errors.std_per_range * safe)
+    own = lidar.range_std if scanner is None else scanner.range_std(safe)
+    own = errors.std_scale * jnp.asarray(own, safe.dtype)
+    std = jnp.hypot(own, errors.std_per_range * safe)
     std = std * jnp.exp(errors.std_by_incidence * returns.incidence)
     safe = round_to(safe + std * jax.random.normal(of_noise, safe.shape, safe.dtype), errors)
-    is_seen = safe >= errors.range_min
-    is_seen &= jax.random.uniform(of_missing, safe.shape, safe.dtype) >= errors.missing
+    is_seen = jax.random.uniform(of_missing, safe.shape, safe.dtype) >= errors.missing
     black_range = errors.black_range * jnp.cos(returns.incidence)
     is_seen &= ~returns.is_black | (returns.distance < black_range)
-    return to_scan(lidar, jnp.where(has_return & is_seen, safe, jnp.inf))
+    scan = to_scan(lidar, jnp.where(has_return & is_seen, safe, jnp.inf))
+    return scan if scanner is None else scanners.digitise(scanner, scan)
 
 
 def round_to(ranges: Array, errors: RangeErrors) -> Array:

@@ -41,12 +41,14 @@ class Movers(NamedTuple):
     """What may move in a world; shapes are fixed, all may be empty.
 
     Attributes:
-        walkway: (N, 2) [m] points about `WALKWAY_SPACING` apart on which people walk to and fro.
+        people: (K,) int32 numbers of the people that there may be: 0, 1, ...
+        walkway: (N, 2) [m] points about `WALKWAY_SPACING` apart on which they walk to and fro.
         doors: (D, 4) [m] ends of closed doors.
         before: (P, 4) [m] ends of the walls of furniture before it is moved.
         after: (P, 4) [m] the same afterwards.
     """
 
+    people: AnyArray
     walkway: AnyArray
     doors: AnyArray
     before: AnyArray
@@ -94,18 +96,18 @@ def walkway(path: Any) -> np.ndarray:
     return np.stack([np.interp(wanted, along, x) for x in points.T], axis=1)
 
 
-def make_crowd(key: Key, traffic: Traffic, movers: Movers, *, slots: int) -> Crowd:
-    """Draw K = `slots` people, of whom the first `traffic.people` are there, and states of doors.
+def make_crowd(key: Key, traffic: Traffic, movers: Movers) -> Crowd:
+    """Draw K people, of whom the first `traffic.people` are there, and states of doors.
 
     Person k is the same whatever their number.
     """
-    points, doors = jnp.asarray(movers.walkway), movers.doors.shape[0]
+    points, numbers = jnp.asarray(movers.walkway), jnp.asarray(movers.people)
     of_people, of_states, of_phases = jax.random.split(key, 3)
 
     def person(number: Array) -> Array:
         return jax.random.uniform(jax.random.fold_in(of_people, number), (6,), points.dtype)
 
-    start, pace, phase, aside, cart, wide = jax.vmap(person, out_axes=1)(jnp.arange(slots))
+    start, pace, phase, aside, cart, wide = jax.vmap(person, out_axes=1)(numbers)
     low, high = PERSON_RADIUS
     radius = jnp.where(cart < traffic.carts, CART_RADIUS, low + (high - low) * wide)
     signed = 2.0 * pace - 1.0  # uniform in -1 to 1: its sign is the direction
@@ -115,9 +117,9 @@ def make_crowd(key: Key, traffic: Traffic, movers: Movers, *, slots: int) -> Cro
         speed=speed,
         phase=CYCLE * phase,
         aside=MAX_ASIDE * (2.0 * aside - 1.0),
-        radius=jnp.where(jnp.arange(slots, dtype=points.dtype) < traffic.people, radius, 0.0),
-        states=jax.random.uniform(of_states, (doors, NUM_STATES), points.dtype),
-        door_phase=jax.random.uniform(of_phases, (doors,), points.dtype),
+        radius=jnp.where(numbers.astype(points.dtype) < traffic.people, radius, 0.0),
+        states=jax.random.uniform(of_states, (len(movers.doors), NUM_STATES), points.dtype),
+        door_phase=jax.random.uniform(of_phases, (len(movers.doors),), points.dtype),
     )
 
 

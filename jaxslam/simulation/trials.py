@@ -12,7 +12,7 @@ from jax import lax
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode
 from jaxslam.core.scan import Scan
-from jaxslam.core.types import Array, Key, as_count, as_size
+from jaxslam.core.types import Array, Key, as_count, as_size, check_type
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
@@ -23,6 +23,7 @@ from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
 from jaxslam.pipeline.results import SlamResult
 from jaxslam.simulation import arguments
 from jaxslam.simulation.drives import num_scans_of_drive, simulate_episode, simulate_scans
+from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
@@ -37,16 +38,24 @@ class _Drive(NamedTuple):
         world: The walls.
         path: (N, 2) [m, world].
         num_scans: T, number of scans.
+        life: What may go wrong; None: nothing.
     """
 
     robot: Robot
     world: World
     path: Array
     num_scans: int
+    life: Life | None
 
 
 def _drive_of(
-    key: Key, config: Config, robot: Robot, world: str | World, path: Any, num_scans: int | None
+    key: Key,
+    config: Config,
+    robot: Robot,
+    world: str | World,
+    path: Any,
+    num_scans: int | None,
+    life: Life | None,
 ) -> _Drive:
     """The drive that the arguments of the functions below describe.
 
@@ -59,9 +68,16 @@ def _drive_of(
     walls = arguments.as_world(world, config.frontend.lidar.range_max)
     arguments.check_lidar_of(robot, config.frontend.lidar)
     points = arguments.as_path(path, world)
+    if life is not None:
+        check_type("life", life, Life, advice=": see jaxslam.simulation.life_in")
+        if len(life.materials) != len(walls.walls):
+            raise ValueError(
+                f"life.materials has {len(life.materials)} walls and world.walls "
+                f"{len(walls.walls)}; make it by jaxslam.simulation.life_in of this world"
+            )
     if num_scans is None:
-        return _Drive(robot, walls, points, num_scans_of_drive(robot, points))
-    return _Drive(robot, walls, points, as_count("num_scans", num_scans))
+        return _Drive(robot, walls, points, num_scans_of_drive(robot, points), life)
+    return _Drive(robot, walls, points, as_count("num_scans", num_scans), life)
 
 
 def replay_trial(
@@ -74,6 +90,7 @@ def replay_trial(
     *,
     trial: int,
     num_scans: int | None = None,
+    life: Life | None = None,
 ) -> tuple[Array, SlamResult]:
     """Simulate one trial of an experiment again and run SLAM on it, without scan matching.
 
@@ -86,6 +103,7 @@ def replay_trial(
         path: (N, 2) [m, world] to drive along; the world's own by default.
         trial: Number of the trial, from 0.
         num_scans: T, number of scans; to the end of the path by default.
+        life: What may go wrong, by `life_in`; None: nothing.
 
     Returns:
         True poses (T, 3), and the result of `offline.run_slam`, not smoothed.
@@ -94,13 +112,13 @@ def replay_trial(
         ValueError: An argument is not possible.
     """
     params = as_params(params, match_scans=False)
-    given = _drive_of(key, config, robot, world, path, num_scans)
+    given = _drive_of(key, config, robot, world, path, num_scans, life)
     number = as_count("trial", trial, least=0)
     trial_key = trial_keys(key, jnp.array([number]))[0]
 
     def scans_of(own: Key) -> tuple[Array, Array, Scan]:
-        lidar, (robot, world, path, num_scans) = config.frontend.lidar, given
-        return simulate_scans(own, lidar, robot, world, path, num_scans=num_scans)
+        lidar, (robot, world, path, num_scans, life) = config.frontend.lidar, given
+        return simulate_scans(own, lidar, robot, world, path, num_scans=num_scans, life=life)
 
     truth, odometry, scans = jax.jit(scans_of)(trial_key)
     result = offline.run_slam(
@@ -118,6 +136,7 @@ def simulate_keys(
     *,
     num_scans: int,
     noise_by_incidence: float = 0.0,
+    life: Life | None = None,
 ) -> Episode:
     """Simulate one trial of `num_scans` scans for each of the keys (B,)."""
     return _simulate_keys(
@@ -128,6 +147,7 @@ def simulate_keys(
         path,
         num_scans=num_scans,
         noise_by_incidence=noise_by_incidence,
+        life=life,
     )
 
 
@@ -141,9 +161,12 @@ def _simulate_keys(
     *,
     num_scans: int,
     noise_by_incidence: float = 0.0,
+    life: Life | None = None,
 ) -> Episode:
     """`simulate_keys`, compiled for the front end alone."""
-    one = partial(simulate_episode, num_scans=num_scans, noise_by_incidence=noise_by_incidence)
+    one = partial(
+        simulate_episode, num_scans=num_scans, noise_by_incidence=noise_by_incidence, life=life
+    )
     return lax.map(lambda key: one(key, config, robot, world, path), keys)
 
 
@@ -162,6 +185,7 @@ def simulate_episodes(
     num_trials: int,
     num_scans: int | None = None,
     noise_by_incidence: float = 0.0,
+    life: Life | None = None,
 ) -> Episode:
     """Simulate trials 0 to B - 1: drives of a robot along a path, and the features of its scans.
 
@@ -176,6 +200,7 @@ def simulate_episodes(
         num_scans: T, scans of a trial; to the end of the path by default.
         noise_by_incidence: [1 / rad] by which the logarithm of the standard deviation of a range
             grows with the angle between its beam and the normal of the wall.
+        life: What may go wrong, by `life_in`; None: nothing.
 
     Returns:
         [B] episodes.
@@ -183,9 +208,9 @@ def simulate_episodes(
     Raises:
         ValueError: An argument is not possible; the message says what is expected.
     """
-    given = _drive_of(key, config, robot, world, path, num_scans)
+    given = _drive_of(key, config, robot, world, path, num_scans, life)
     keys = trial_keys(key, jnp.arange(as_count("num_trials", num_trials)))
-    robot, walls, points, steps = given
+    robot, walls, points, steps, life = given
     return simulate_keys(
         keys,
         config,
@@ -194,6 +219,7 @@ def simulate_episodes(
         points,
         num_scans=steps,
         noise_by_incidence=as_size("noise_by_incidence", noise_by_incidence, unit="1 / rad"),
+        life=life,
     )
 
 
@@ -205,12 +231,14 @@ class _Common(NamedTuple):
         params: Q and R that the filter assumes.
         world: The world.
         path: (N, 2) [m, world].
+        life: What may go wrong; None: nothing.
     """
 
     key: Array
     params: NoiseParams
     world: World
     path: Array
+    life: Life | None
 
 
 def _filter_group(
@@ -224,7 +252,8 @@ def _filter_group(
 ) -> TrialResult:
     """Simulate the trials with the numbers (EPISODE_BATCH,) in turn, and filter them together."""
     keys = trial_keys(jax.random.wrap_key_data(common.key, impl=key_type), numbers)
-    episodes = _simulate_keys(keys, frontend, robot, common.world, common.path, num_scans=num_scans)
+    given = frontend, robot, common.world, common.path
+    episodes = _simulate_keys(keys, *given, num_scans=num_scans, life=common.life)
     return filter_batch(config, common.params, episodes)
 
 
@@ -241,6 +270,7 @@ def run_trials(
     *,
     num_trials: int,
     num_scans: int | None = None,
+    life: Life | None = None,
     first: int = 0,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[TrialResult]:
@@ -266,6 +296,7 @@ def run_trials(
             default.
         num_trials: B, number of trials.
         num_scans: T, scans of a trial; to the end of the path by default.
+        life: What may go wrong, by `life_in`; None: nothing.
         first: Number of the first trial; those before it were done by another call.
         devices: To be used; all, of all processes, by default.
 
@@ -273,7 +304,7 @@ def run_trials(
         ValueError: An argument is not possible; at the call, before the first result is asked for.
     """
     params = as_params(params, match_scans=False)
-    given = _drive_of(key, config, robot, world, path, num_scans)
+    given = _drive_of(key, config, robot, world, path, num_scans, life)
     total = as_count("num_trials", num_trials)
     begin = as_count("first", first, least=0)
     if devices is not None and not len(devices):
@@ -292,7 +323,7 @@ def _run_groups(
     devices: Sequence[jax.Device],
 ) -> Iterator[TrialResult]:
     """The loop of `run_trials`, whose arguments are checked."""
-    common = _Common(jax.random.key_data(key), params, given.world, given.path)
+    common = _Common(jax.random.key_data(key), params, given.world, given.path, given.life)
     static = config.frontend, config.filter, given.robot, given.num_scans, jax.random.key_impl(key)
     per_round = EPISODE_BATCH * len(devices)
 

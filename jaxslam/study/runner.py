@@ -17,6 +17,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import trials
+from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 from jaxslam.study.outcomes import Outcomes, concatenate, outcomes_of
@@ -36,6 +37,7 @@ class Variant(NamedTuple):
         world: Its building.
         path: (N, 2) [m, world] that it drives.
         num_scans: T, scans of a trial.
+        life: What may go wrong; None: nothing.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Variant(NamedTuple):
     world: World
     path: np.ndarray
     num_scans: int
+    life: Life | None = None
 
 
 class Progress(NamedTuple):
@@ -139,6 +142,7 @@ def _results(
         variant.path,
         num_trials=num_trials,
         num_scans=variant.num_scans,
+        life=variant.life,
         first=first,
     )
 
@@ -148,7 +152,7 @@ def fingerprint(variant: Variant, seed: int) -> str:
 
     Trials of another program are others.
     """
-    arrays = jax.tree.leaves((variant.world, variant.path, variant.params))
+    arrays = jax.tree.leaves((variant.world, variant.path, variant.params, variant.life))
     fixed = variant.config, variant.robot, variant.num_scans
     text = hashlib.sha256(repr((fixed, seed, trace_cache.version())).encode())
     for x in arrays:

@@ -11,17 +11,17 @@ from jaxslam.simulation.traffic import Movers, Traffic, make_crowd, moved_walls,
 CORNERS = np.array([[0.0, 0.0], [8.0, 0.0], [8.0, 6.0]])
 DOORS = np.array([[2.0, -1.0, 2.0, 1.0], [8.0, 3.0, 9.0, 3.0]])
 CHAIR = np.array([[1.0, 1.0, 1.5, 1.0]])
-MOVERS = Movers(walkway(CORNERS), DOORS, CHAIR, CHAIR + 2.0)
+MOVERS = Movers(np.arange(30), walkway(CORNERS), DOORS, CHAIR, CHAIR + 2.0)
 FAR = jnp.array([100.0, 100.0])
 TIMES = jnp.arange(0.0, 400.0, 0.5)
 
 
 def crowd_of(traffic, slots=30, seed=0):
-    return make_crowd(jax.random.key(seed), traffic, MOVERS, slots=slots)
+    return make_crowd(jax.random.key(seed), traffic, MOVERS._replace(people=np.arange(slots)))
 
 
-def centres_of(traffic, slots=30, scanner=FAR):
-    crowd = crowd_of(traffic, slots)
+def centres_of(traffic, scanner=FAR):
+    crowd = crowd_of(traffic)
     at = jax.jit(jax.vmap(lambda t: people_at(crowd, traffic, MOVERS, t, scanner)[0]))
     return np.asarray(at(TIMES)), np.asarray(crowd.radius)
 
@@ -101,8 +101,8 @@ def test_furniture_is_moved_once_and_a_world_may_have_nothing_that_moves():
     np.testing.assert_array_equal(before, CHAIR)
     np.testing.assert_array_equal(after, CHAIR + 2.0)
     none = np.zeros((0, 4))
-    empty = Movers(MOVERS.walkway, none, none, none)
-    crowd = make_crowd(jax.random.key(0), traffic, empty, slots=0)
+    empty = Movers(np.arange(0), MOVERS.walkway, none, none, none)
+    crowd = make_crowd(jax.random.key(0), traffic, empty)
     assert moved_walls(crowd, traffic, empty, 1.0, FAR).shape == (0, 4)
     assert people_at(crowd, traffic, empty, 1.0, FAR)[0].shape == (0, 2)
 

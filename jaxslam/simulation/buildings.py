@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxslam.core.types import as_size
 from jaxslam.simulation import room_rows
-from jaxslam.simulation.furniture import Frame, Furniture, furnish, join, random_mm
+from jaxslam.simulation.furniture import Frame, Furniture, furnish_corridor, join, random_mm
 from jaxslam.simulation.room_rows import Block
 from jaxslam.simulation.worlds import Box, World, outline, polyline
 
@@ -175,5 +175,5 @@ def _in_corridor(
         for a0, b0, a1, b1 in openings
         if a0 <= x1 and a1 >= x0 and b0 <= y1 and b1 >= y0
     ]
-    found = furnish(rng, (round(x1 - x0, 3), round(y1 - y0, 3)), beside, corridor=True)
+    found = furnish_corridor(rng, (round(x1 - x0, 3), round(y1 - y0, 3)), beside)
     return found.moved(Frame((x0, y0), (1, 0)))

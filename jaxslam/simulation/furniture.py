@@ -6,6 +6,7 @@ of each door stays free. By boxes around the pieces, so that the distances hold 
 """
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -58,22 +59,50 @@ class Furniture(NamedTuple):
         columns: x, y and radius [m] of round columns.
     """
 
-    shelves: Sequence[Box]
-    polygons: Sequence[np.ndarray]
-    columns: Sequence[tuple[float, float, float]]
+    shelves: list[Box]
+    polygons: list[np.ndarray]
+    columns: list[tuple[float, float, float]]
 
     def moved(self, frame: Frame) -> "Furniture":
         """The pieces, given in a frame, in the world."""
-        middles = [frame.points(np.array([column[:2]]))[0] for column in self.columns]
+        middles = [frame.points(np.array([column[:2]]))[0].tolist() for column in self.columns]
         return Furniture(
             [frame.box(box) for box in self.shelves],
             [frame.points(polygon) for polygon in self.polygons],
-            [(*middle.tolist(), c[2]) for middle, c in zip(middles, self.columns, strict=True)],
+            [(x, y, c[2]) for (x, y), c in zip(middles, self.columns, strict=True)],
         )
 
     def outlines(self) -> list[np.ndarray]:
         """Corners (n, 2) [m] of the pieces that are no shelves, counter-clockwise."""
         return [*self.polygons, *(circle(*column) for column in self.columns)]
+
+
+class _Space(NamedTuple):
+    """A room while it is furnished.
+
+    Attributes:
+        size: [m]; its corner is the origin.
+        taken: Boxes that are no longer free, with the distance [m] that pieces keep from each.
+        found: The pieces so far; changed in place.
+    """
+
+    size: tuple[float, float]
+    taken: list[tuple[Box, float]]
+    found: Furniture
+
+    def take(self, low: np.ndarray, high: np.ndarray) -> Box | None:
+        """A box with corners (2,), if a piece may stand there; it is then taken."""
+        box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        for k in range(2):
+            gaps = (box[k], self.size[k] - box[k + 2])
+            narrow = any(1e-9 < gap < PASSAGE for gap in gaps)
+            if narrow or min(gaps) < -1e-9 or max(gaps) < PASSAGE:
+                return None
+        for other, gap in self.taken:
+            if max(max(other[k] - box[k + 2], box[k] - other[k + 2]) for k in range(2)) < gap:
+                return None
+        self.taken.append((box, PASSAGE))
+        return box
 
 
 def random_mm(rng: np.random.Generator, low: float, high: float) -> float:
@@ -83,7 +112,11 @@ def random_mm(rng: np.random.Generator, low: float, high: float) -> float:
 
 def join(pieces: Sequence[Furniture]) -> Furniture:
     """The pieces of several rooms."""
-    return Furniture(*([x for some in pieces for x in some[k]] for k in range(3)))
+    return Furniture(
+        [x for some in pieces for x in some.shelves],
+        [x for some in pieces for x in some.polygons],
+        [x for some in pieces for x in some.columns],
+    )
 
 
 def circle(x: float, y: float, radius: float) -> np.ndarray:
@@ -98,129 +131,112 @@ def furnish(
     size: tuple[float, float],
     openings: Sequence[Box],
     *,
-    corridor: bool = False,
+    empty: bool = True,
 ) -> Furniture:
-    """Furniture of a room, or of a corridor: cupboards, and columns in the middle.
+    """Furniture of a room.
 
     Args:
         rng: Generator of the random numbers.
         size: [m] of the room, whose corner is the origin.
-        openings: Boxes [m] beyond its sides, the doors; or other corridors that it meets.
-        corridor: Whether it is one.
+        openings: Boxes [m] beyond its sides: the doors.
+        empty: Whether it may be without furniture; a small room may be in any case.
     """
-    taken = [_space_before(box, size) for box in openings]
-    found = Furniture([], [], [])
-    area, narrow = size[0] * size[1], min(size)
-    if corridor:
-        if narrow >= MIN_FURNISHED_CORRIDOR:
-            _add_shelves(rng, size, taken, found, rng.poisson(0.08 * max(size)), depth=0.4)
-            _add_columns(rng, size, taken, found, rng.poisson(0.06 * max(size)), middle=True)
-        return found
-    _add_shelves(rng, size, taken, found, rng.integers(0, 3), depth=0.55)
-    for _ in range(rng.poisson(min(area / 15.0, 3.0))):
-        _add_table(rng, size, taken, found)
-    for _ in range(rng.poisson(min(area / 20.0, 2.0))):
-        _add_box(rng, size, taken, found)
-    if area > 20.0:
-        _add_columns(rng, size, taken, found, rng.integers(0, 2), middle=False)
-    return found
+    area = size[0] * size[1]
+    for _ in range(1 if empty else TRIES):
+        space = _space(size, openings)
+        _add_shelves(rng, space, int(rng.integers(0, 3)), 0.55)
+        for _ in range(rng.poisson(min(area / 15.0, 3.0))):
+            _add_table(rng, space)
+        for _ in range(rng.poisson(min(area / 20.0, 2.0))):
+            _add_box(rng, space)
+        if area > 20.0:
+            _add_columns(rng, space, int(rng.integers(0, 2)), in_line=False)
+        if any(space.found):
+            break
+    return space.found
+
+
+def furnish_corridor(
+    rng: np.random.Generator, size: tuple[float, float], openings: Sequence[Box]
+) -> Furniture:
+    """Cupboards and columns of a corridor, which is wide enough or has none.
+
+    Args:
+        rng: Generator of the random numbers.
+        size: [m] of the corridor, whose corner is the origin.
+        openings: Boxes [m]: doors, and the corridors that it meets.
+    """
+    space = _space(size, openings)
+    if min(size) >= MIN_FURNISHED_CORRIDOR:
+        _add_shelves(rng, space, int(rng.poisson(0.08 * max(size))), 0.4)
+        _add_columns(rng, space, int(rng.poisson(0.06 * max(size))), in_line=True)
+    return space.found
 
 
 def furnish_hall(
     rng: np.random.Generator, size: tuple[float, float], openings: Sequence[Box]
 ) -> Furniture:
-    """Furniture of a hall: rows of columns, and tables between them."""
-    taken = [_space_before(box, size) for box in openings]
-    found = Furniture([], [], [])
+    """Furniture of a hall: rows of columns, and tables between them; arguments as of `furnish`."""
+    space = _space(size, openings)
     radius = random_mm(rng, 0.2, 0.35)
-    counts = [max(1, round(side / COLUMN_SPACING) - 1) for side in size]
-    for i in range(1, counts[0] + 1):
-        for j in range(1, counts[1] + 1):
-            x, y = (
-                round(size[k] * n / (counts[k] + 1), 3) for k, n in enumerate((i, j))
-            )
-            if _is_free((x - radius, y - radius, x + radius, y + radius), size, taken):
-                found.columns.append((x, y, radius))
+    places = [
+        [round(side * n / k, 3) for n in range(1, k)]
+        for side in size
+        for k in (max(2, round(side / COLUMN_SPACING)),)
+    ]
+    for middle in product(*places):
+        if space.take(np.array(middle) - radius, np.array(middle) + radius):
+            space.found.columns.append((middle[0], middle[1], radius))
     for _ in range(rng.integers(1, 5)):
-        _add_table(rng, size, taken, found)
-    return found
+        _add_table(rng, space)
+    return space.found
 
 
-def _space_before(opening: Box, size: tuple[float, float]) -> tuple[Box, float]:
-    """The space in front of an opening in the border of a room, which stays free.
-
-    Returns:
-        Its box, and the distance [m] that pieces keep from it.
-    """
-    low = [max(opening[k] - DOOR_SPACE, 0.0) for k in range(2)]
-    high = [min(opening[k + 2] + DOOR_SPACE, size[k]) for k in range(2)]
-    for k in range(2):  # as wide as the door
-        if opening[k] >= 0.0 and opening[k + 2] <= size[k]:
-            low[k], high[k] = opening[k], opening[k + 2]
-    return (low[0], low[1], high[0], high[1]), 0.0
-
-
-def _is_free(
-    box: Box, size: tuple[float, float], taken: list[tuple[Box, float]]
-) -> bool:
-    """Whether a piece in a box leaves what others and the walls need; it is then taken."""
-    for k in range(2):
-        gaps = (box[k], size[k] - box[k + 2])
-        if any(1e-9 < gap < PASSAGE for gap in gaps) or min(gaps) < -1e-9 or max(gaps) < PASSAGE:
-            return False
-    for other, gap in taken:
-        apart = max(max(other[k] - box[k + 2], box[k] - other[k + 2]) for k in range(2))
-        if apart < gap:
-            return False
-    taken.append((box, PASSAGE))
-    return True
+def _space(size: tuple[float, float], openings: Sequence[Box]) -> _Space:
+    """A room without furniture, with the space in front of its openings taken."""
+    taken: list[tuple[Box, float]] = []
+    for opening in openings:
+        low = [max(opening[k] - DOOR_SPACE, 0.0) for k in range(2)]
+        high = [min(opening[k + 2] + DOOR_SPACE, size[k]) for k in range(2)]
+        for k in range(2):  # as wide as the door
+            if opening[k] >= 0.0 and opening[k + 2] <= size[k]:
+                low[k], high[k] = opening[k], opening[k + 2]
+        taken.append(((low[0], low[1], high[0], high[1]), 0.0))
+    return _Space(size, taken, Furniture([], [], []))
 
 
-def _add_shelves(
-    rng: np.random.Generator,
-    size: tuple[float, float],
-    taken: list[tuple[Box, float]],
-    found: Furniture,
-    count: int,
-    *,
-    depth: float,
-) -> None:
+def _add_shelves(rng: np.random.Generator, space: _Space, count: int, depth: float) -> None:
     """Shelves along walls, some of them in corners, at most `depth` [m] deep."""
     for _ in range(count * TRIES):
-        if len(found.shelves) == count:
+        if len(space.found.shelves) == count:
             return
-        along, high = int(rng.integers(2)), bool(rng.integers(2))
+        along, beyond = int(rng.integers(2)), bool(rng.integers(2))
         length, deep = random_mm(rng, 0.8, 2.0), random_mm(rng, 0.25, depth)
-        spare = size[along] - length
-        if spare < 2 * PASSAGE:
+        in_corner, share = rng.random() < 0.3, rng.random()
+        spare = space.size[along] - length - 2 * PASSAGE
+        if spare < 0.0:
             continue
-        start = random_mm(rng, PASSAGE, spare - PASSAGE) if rng.random() < 0.7 else 0.0
-        across = size[1 - along]
-        away = (round(across - deep, 3), across) if high else (0.0, deep)
-        span = (start, round(start + length, 3))
-        box = (span[0], away[0], span[1], away[1])
-        if along == 1:
-            box = (away[0], span[0], away[1], span[1])
-        if _is_free(box, size, taken):
-            found.shelves.append(box)
+        low, high = np.zeros(2), np.zeros(2)
+        low[along] = 0.0 if in_corner else round(PASSAGE + share * spare, 3)
+        high[along] = round(low[along] + length, 3)
+        side = space.size[1 - along]
+        low[1 - along], high[1 - along] = (round(side - deep, 3), side) if beyond else (0.0, deep)
+        box = space.take(low, high)
+        if box is not None:
+            space.found.shelves.append(box)
 
 
 def _place(
-    rng: np.random.Generator,
-    size: tuple[float, float],
-    taken: list[tuple[Box, float]],
-    half: np.ndarray,
-    angle: float,
+    rng: np.random.Generator, space: _Space, half: np.ndarray, angle: float
 ) -> np.ndarray | None:
     """Middle (2,) [m] of a rectangle with half sides (2,) [m] that stands free; None if nowhere."""
     reach = np.abs(_turned(_CORNERS * half, angle)).max(axis=0)
-    low, high = PASSAGE + reach, np.array(size) - PASSAGE - reach
+    low, high = PASSAGE + reach, np.array(space.size) - PASSAGE - reach
     if (low > high).any():
         return None
     for _ in range(TRIES):
-        middle = rng.uniform(low, high).round(3)
-        ends = [*(middle - reach).tolist(), *(middle + reach).tolist()]
-        if _is_free((ends[0], ends[1], ends[2], ends[3]), size, taken):
+        middle: np.ndarray = rng.uniform(low, high).round(3)
+        if space.take(middle - reach, middle + reach):
             return middle
     return None
 
@@ -228,57 +244,40 @@ def _place(
 def _turned(points: np.ndarray, angle: float) -> np.ndarray:
     """Points (N, 2) turned counter-clockwise by an angle [rad] about the origin."""
     cos, sin = np.cos(angle), np.sin(angle)
-    return points @ np.array([[cos, sin], [-sin, cos]])
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
 
 
-def _add_table(
-    rng: np.random.Generator,
-    size: tuple[float, float],
-    taken: list[tuple[Box, float]],
-    found: Furniture,
-) -> None:
+def _add_table(rng: np.random.Generator, space: _Space) -> None:
     """A table, of which a scanner sees the four legs; half of them at an angle."""
     half = np.array([random_mm(rng, 0.6, 0.9), random_mm(rng, 0.35, 0.45)])
     angle = float(rng.choice([0.0, 0.5 * np.pi, *rng.uniform(-np.pi, np.pi, 2)]))
-    middle = _place(rng, size, taken, half, angle)
+    middle = _place(rng, space, half, angle)
     if middle is not None:
         leg = random_mm(rng, 0.02, 0.04)  # half of its side
         for corner in _CORNERS * (half - leg):
-            found.polygons.append(middle + _turned(corner + leg * _CORNERS, angle))
+            space.found.polygons.append(middle + _turned(corner + leg * _CORNERS, angle))
 
 
-def _add_box(
-    rng: np.random.Generator,
-    size: tuple[float, float],
-    taken: list[tuple[Box, float]],
-    found: Furniture,
-) -> None:
+def _add_box(rng: np.random.Generator, space: _Space) -> None:
     """A box at an angle."""
     half = np.array([random_mm(rng, 0.15, 0.45), random_mm(rng, 0.15, 0.45)])
     angle = float(rng.uniform(-np.pi, np.pi))
-    middle = _place(rng, size, taken, half, angle)
+    middle = _place(rng, space, half, angle)
     if middle is not None:
-        found.polygons.append(middle + _turned(half * _CORNERS, angle))
+        space.found.polygons.append(middle + _turned(half * _CORNERS, angle))
 
 
-def _add_columns(
-    rng: np.random.Generator,
-    size: tuple[float, float],
-    taken: list[tuple[Box, float]],
-    found: Furniture,
-    count: int,
-    *,
-    middle: bool,
-) -> None:
-    """Round columns, anywhere or in the middle of the shorter side."""
+def _add_columns(rng: np.random.Generator, space: _Space, count: int, *, in_line: bool) -> None:
+    """Round columns, anywhere or along the middle of a corridor."""
     for _ in range(count):
         radius = random_mm(rng, 0.12, 0.25)
-        low = np.full(2, PASSAGE + radius)
-        high = np.array(size) - low
+        low, high = np.full(2, PASSAGE + radius), np.array(space.size) - PASSAGE - radius
         if (low > high).any():
-            return
-        x, y = rng.uniform(low, high).round(3).tolist()
-        if middle:
-            x, y = (x, size[1] / 2) if size[0] > size[1] else (size[0] / 2, y)
-        if _is_free((x - radius, y - radius, x + radius, y + radius), size, taken):
-            found.columns.append((x, y, radius))
+            continue
+        middle: np.ndarray = rng.uniform(low, high).round(3)
+        if in_line:
+            across = int(np.argmin(space.size))
+            middle[across] = round(space.size[across] / 2, 3)
+        if space.take(middle - radius, middle + radius):
+            x, y = middle.tolist()
+            space.found.columns.append((x, y, radius))

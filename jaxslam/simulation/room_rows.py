@@ -14,6 +14,7 @@ The frames of the four sides of a block differ by quarter turns, so look-alike r
 of a block are equal, not mirrored.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -149,7 +150,8 @@ def _places(
         width = np.floor(1000 * (length - (count - 1) * thick) / count) / 1000
         starts = [k * (width + thick) for k in range(count)]
         return [(round(start, 3), round(start + width, 3)) for start in starts]
-    ends, start = [], 0.0
+    ends: list[tuple[float, float]] = []
+    start = 0.0
     while True:
         left = length - start
         widest = left - thick - ROOM_WIDTH[0]
@@ -190,7 +192,7 @@ def _add_alike(
             openings = [(entry[0], -thick, entry[1], 0.0)]
             if into_back is not None and not in_back:
                 openings.append((into_back[0], row.depth, into_back[1], row.depth + thick))
-            found = furnish(rng, (width, row.depth), openings)
+            found = furnish(rng, (width, row.depth), openings, empty=False)
         for k, (start, _) in enumerate(row.places):
             frame, name = row.frame.moved(start, 0.0), len(plan.rooms)
             plan.rooms.append(frame.box((0.0, 0.0, width, row.depth)))
@@ -205,45 +207,36 @@ def _add_others(
 ) -> None:
     """Add rows of rooms to a plan, each with a door to its corridor or to the room before it."""
     first = len(plan.rooms)
-    openings: list[list[Box]] = [[] for row in rows for _ in row.places]  # in the rooms' frames
+    places = [(row, n) for row in rows for n in range(len(row.places))]
+    openings: list[list[Box]] = [[] for _ in places]  # in the frames of the rows
 
-    def beside(
-        k: int, row: _Row, start: float, end: float, own: bool, at: float, other: int
-    ) -> None:
-        """A door in the wall beyond v = `at`, or in the one beyond the coordinate u = `at`."""
-        door = (start, at, end, at + thick) if own else (at, start, at + thick, end)
+    def add(k: int, door: Box, other: int) -> None:
         openings[k].append(door)
-        frame = row.frame.moved(row.places[0][0], 0.0)
-        _add_door(plan, frame.box(door), first + k, other)
+        _add_door(plan, places[k][0].frame.box(door), first + k, other)
 
-    k = 0
-    for row in rows:
-        for n, (start, end) in enumerate(row.places):
-            doors = 2 if hall and end - start > 6.0 else 1
-            cuts = np.linspace(start, end, doors + 1).round(3).tolist()
-            for low, high in zip(cuts, cuts[1:], strict=False):
-                behind = row.corridor < 0
-                other = first + n if behind else rooms + row.corridor
-                beside(k, row, *_door(rng, low, high), True, -thick, other)
-                if behind:  # the same opening, in the frame of the room before it
-                    u0, _, u1, _ = openings[k][-1]
-                    openings[n].append((u0, rows[0].depth, u1, rows[0].depth + thick))
-            last = n == len(row.places) - 1
-            other = first + k + 1 if not last else rooms + row.ends[1]
-            if (not last or row.ends[1] >= 0) and rng.random() < EXTRA_DOOR_SHARE:
-                beside(k, row, *_door(rng, 0.0, row.depth), False, end, other)
-                if not last:
-                    openings[k + 1].append(openings[k][-1])
-            if n == 0 and row.ends[0] >= 0 and rng.random() < EXTRA_DOOR_SHARE:
-                beside(k, row, *_door(rng, 0.0, row.depth), False, -thick, rooms + row.ends[0])
-            k += 1
-    k = 0
-    for row in rows:
-        for start, end in row.places:
-            frame, size = row.frame.moved(start, 0.0), (round(end - start, 3), row.depth)
-            local = [(u0 - start, v0, u1 - start, v1) for u0, v0, u1, v1 in openings[k]]
-            found = (furnish_hall if hall else furnish)(rng, size, local)
-            plan.rooms.append(frame.box((0.0, 0.0, *size)))
-            plan.alike.append(-1)
-            plan.furniture.append(found.moved(frame))
-            k += 1
+    for k, (row, n) in enumerate(places):
+        start, end = row.places[n]
+        cuts = np.linspace(start, end, 3 if hall and end - start > 6.0 else 2).round(3).tolist()
+        for low, high in pairwise(cuts):
+            door = _door(rng, low, high)
+            behind = row.corridor < 0
+            add(k, (door[0], -thick, door[1], 0.0), first + n if behind else rooms + row.corridor)
+            if behind:  # the same opening, in the frame of the row before it
+                depth = rows[0].depth
+                openings[n].append((door[0], depth, door[1], depth + thick))
+        last = n == len(row.places) - 1
+        if (not last or row.ends[1] >= 0) and rng.random() < EXTRA_DOOR_SHARE:
+            low, high = _door(rng, 0.0, row.depth)
+            add(k, (end, low, end + thick, high), rooms + row.ends[1] if last else first + k + 1)
+            if not last:
+                openings[k + 1].append(openings[k][-1])
+        if n == 0 and row.ends[0] >= 0 and rng.random() < EXTRA_DOOR_SHARE:
+            low, high = _door(rng, 0.0, row.depth)
+            add(k, (-thick, low, 0.0, high), rooms + row.ends[0])
+    for (row, n), doors in zip(places, openings, strict=True):
+        start, end = row.places[n]
+        frame, size = row.frame.moved(start, 0.0), (round(end - start, 3), row.depth)
+        local = [(u0 - start, v0, u1 - start, v1) for u0, v0, u1, v1 in doors]
+        plan.rooms.append(frame.box((0.0, 0.0, *size)))
+        plan.alike.append(-1)
+        plan.furniture.append((furnish_hall if hall else furnish)(rng, size, local).moved(frame))

@@ -1,11 +1,14 @@
 """Simulated worlds, robots, scans and drives, and Monte-Carlo trials of them."""
 
+from jaxslam.simulation.buildings import building as building
 from jaxslam.simulation.drives import drive as drive
 from jaxslam.simulation.drives import num_scans_of_drive as num_scans_of_drive
 from jaxslam.simulation.drives import simulate_scans as simulate_scans
 from jaxslam.simulation.floor_plans import floor_plan as floor_plan
 from jaxslam.simulation.path_following import densify as densify
 from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
+from jaxslam.simulation.patrols import patrol as patrol
+from jaxslam.simulation.patrols import route as route
 from jaxslam.simulation.ray_casting import add_range_noise as add_range_noise
 from jaxslam.simulation.ray_casting import cast as cast
 from jaxslam.simulation.robot import Robot as Robot

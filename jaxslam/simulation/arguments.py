@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxslam.core.arguments import as_float
 from jaxslam.core.types import Array
-from jaxslam.simulation import worlds
-from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW, densify
+from jaxslam.simulation import named_worlds, worlds
+from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
@@ -70,7 +70,7 @@ def as_world(world: Any) -> World:
         ValueError: There is no world of this name, or the walls are not (S, 4) finite numbers.
     """
     if isinstance(world, str):
-        return World(jnp.asarray(worlds.named(world).walls, float))
+        return World(jnp.asarray(named_worlds.named_world(world).walls, float))
     if not isinstance(world, World):
         raise ValueError(
             f"world is {type(world).__name__}, not World or one of the names "
@@ -86,7 +86,7 @@ def as_path(path: Any, world: Any) -> Array:
     """A path (N, 2) [m] in JAX's precision.
 
     Args:
-        path: Its points; None for the drive that belongs to the world.
+        path: Its points; None for the drive of the world: its own, a patrol in a random building.
         world: Name of the world, or `World`.
 
     Raises:
@@ -95,8 +95,11 @@ def as_path(path: Any, world: Any) -> Array:
     """
     if path is None:
         if not isinstance(world, str):
-            raise ValueError("path is None; a world without a name has no drive of its own")
-        return jnp.asarray(densify(worlds.waypoints(world)), float)
+            raise ValueError(
+                "path is None; a world without a name has no drive of its own: find one with "
+                "jaxslam.simulation.patrols"
+            )
+        return jnp.asarray(named_worlds.named_path(world), float)
     points = as_float("path", path, ("N", 2))
     check_path(points)
     if not np.isfinite(points).all():

@@ -16,6 +16,7 @@ from jaxslam.core import polylines
 from jaxslam.simulation.wall_grid import PATH_SPACING, WallGrid
 
 PREFERRED = 0.25  # [m] of clearance beyond the robot's radius, where there is as much
+KEPT = 0.1  # [m] of it that smoothing never takes away: a robot cuts the corners of a path
 REACHES = (0.8, 0.4, 0.2, 0.1, 0.1)  # [m] along the path to the points that draw
 ROUNDS = 25  # of each
 CHECK_SPACING = 0.02  # [m] of the points at which the result is checked
@@ -57,6 +58,7 @@ def _relaxed(grid: WallGrid, line: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     before = np.maximum.accumulate(np.where(fixed, index, 0))
     after = np.minimum.accumulate(np.where(fixed, index, len(line))[::-1])[::-1]
     least = np.hypot(grid.robot_radius, grid.resolution)
+    least = np.clip(_values(grid, field[:1], line)[0], least, grid.robot_radius + KEPT)
     step = np.hypot(*np.diff(line, axis=0).T).mean()
     points = line.copy()
     for reach in REACHES:

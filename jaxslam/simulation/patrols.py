@@ -58,7 +58,7 @@ def patrol(
 
     Args:
         walls: (S, 4) [m] ends x1, y1, x2, y2 of any world, closed or not.
-        start: (2,) [m] where it begins; None: in a room of the largest enclosed region.
+        start: (2,) [m] where it begins; None: in a room of the main enclosed region.
         closed: Whether it ends where it begins.
         robot_radius: [m] that it keeps from all walls.
         resolution: [m] as of `wall_grid.wall_grid`.
@@ -100,7 +100,7 @@ def route(
         walls: (S, 4) [m] ends x1, y1, x2, y2 of any world, closed or not.
         start: (2,) [m] S; None: what is furthest from F.
         goal: (2,) [m] F; None: what is furthest from S. Without both, the two are about as far
-            apart as any in the largest enclosed region.
+            apart as any in the main enclosed region.
         robot_radius: [m] that it keeps from all walls.
         resolution: [m] as of `wall_grid.wall_grid`.
 

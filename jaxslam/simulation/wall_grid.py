@@ -21,7 +21,7 @@ from jaxslam.mapping import medial_axis
 RESOLUTION = 0.05  # [m] side of a cell, at most a quarter of the robot's radius
 MAX_CELLS = 4_000_000  # of a grid; larger worlds have larger cells
 MAX_RESOLUTION = 0.75  # [robot_radius] side of a cell, at most
-PATH_SPACING = 0.05  # [m] between points of a path, whose chords keep the radius, too
+PATH_SPACING = 0.02  # [m] between points of a path: pure pursuit looks for the nearest of 40
 SNAP = 3.0  # [cells] from a given point to the cell that stands for it, at most
 _EIGHT = np.ones((3, 3), bool)
 
@@ -142,7 +142,9 @@ def choose_region(grid: WallGrid, start: np.ndarray | None) -> tuple[np.ndarray,
 
     Args:
         grid: The walls.
-        start: (2,) [m] where it starts; None: in the largest region that the walls enclose.
+        start: (2,) [m] where it starts; None: in an enclosed region, the one with the most space
+            and walls. The inside of a large block has more space, but fewer walls, than the rooms
+            around it; the inside of a thick wall has more walls, but less space.
 
     Raises:
         ValueError: It does not fit at the start, or, without one, in no enclosed region.
@@ -152,13 +154,13 @@ def choose_region(grid: WallGrid, start: np.ndarray | None) -> tuple[np.ndarray,
     enclosed = area.copy()
     enclosed[grid.outside] = 0.0
     if start is None:
-        chosen = int(enclosed.argmax())
+        chosen = int((np.sqrt(enclosed) * _walls_beside(grid)).argmax())
         if not enclosed[chosen]:
             raise ValueError(
                 "walls enclose no free space in which a robot with robot_radius = "
                 f"{grid.robot_radius:g} m fits; give start = (x, y) where it begins"
             )
-        note = f"chosen: the largest region that the walls enclose, {area[chosen]:.1f} m^2"
+        note = f"chosen: the main region that the walls enclose, {area[chosen]:.1f} m^2"
     else:
         chosen = int(grid.region[tuple(cell_at(grid, start, "start"))])
         kind = "not enclosed by walls" if chosen == grid.outside else "enclosed by walls"
@@ -173,6 +175,17 @@ def choose_region(grid: WallGrid, start: np.ndarray | None) -> tuple[np.ndarray,
     if grid.resolution > RESOLUTION:
         notes.append(f"cells of {grid.resolution:.2g} m: narrow passages may be missed")
     return grid.region == chosen, tuple(notes)
+
+
+def _walls_beside(grid: WallGrid) -> np.ndarray:
+    """Length (K + 1,) [m] of the walls beside each region, by the cells that they pass through."""
+    reach = grid.robot_radius + 3 * grid.resolution
+    near = (grid.region > 0) & (grid.clearance < reach)
+    i, j = grid.nearest_wall[:, near]
+    cell = i.astype(np.int64) * grid.region.shape[1] + j
+    pairs = np.unique(grid.region[near] * np.int64(grid.region.size) + cell)
+    count = np.bincount(pairs // grid.region.size, minlength=int(grid.region.max()) + 1)
+    return np.asarray(count * grid.resolution)
 
 
 def cell_at(grid: WallGrid, point: np.ndarray, name: str) -> np.ndarray:

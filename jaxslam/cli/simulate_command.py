@@ -32,6 +32,11 @@ from jaxslam.simulation.robot import Robot
 OptionalUnit = Annotated[str | None, tyro.conf.arg(metavar="UNIT", help_behavior_hint="")]
 """Option that is a unit of length, or not given."""
 
+OptionalDrive = Annotated[
+    Literal["patrol", "route"] | None, tyro.conf.arg(metavar="KIND", help_behavior_hint="")
+]
+"""Option that names a kind of drive, or none."""
+
 Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")]
 """Option that names layers of a drawing, or none."""
 
@@ -39,6 +44,7 @@ Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behav
 def simulate(
     world: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "office",
     path: OptionalFile = None,
+    drive: OptionalDrive = None,
     resolution: OptionalLength = None,
     unit: OptionalUnit = None,
     layers: Layers = (),
@@ -55,12 +61,15 @@ def simulate(
     errors.png of trial 0, whose time stamps are the scan numbers.
 
     Args:
-        world: World with a path from S to F: office; or a file: ROS map (.yaml), picture of a plan
-            (.png, .pgm, ..., with --resolution), GeoJSON, CSV of walls x1,y1,x2,y2, SVG or DXF
-            (both need the extra [cad]).
+        world: World with a path from S to F: office; random:SEED or random:SEED:40x25 [m], a random
+            building, which is patrolled; or a file: ROS map (.yaml), picture of a plan (.png, .pgm,
+            ..., with --resolution), GeoJSON, CSV of walls x1,y1,x2,y2, SVG or DXF (both need the
+            extra [cad]).
         path: File of the waypoints that straight lines join, in the coordinates of the world's
             file, in metres: CSV of x,y, or GeoJSON of one LineString; a file has no path of its
             own.
+        drive: A drive that is found instead of `--path`, in any world: patrol through all rooms,
+            or route between two of its ends that are far apart.
         resolution: Side of a pixel [m] of a picture.
         unit: Unit of a drawing where its file states none: m, cm, mm, in, ft, or the metres of a
             unit, as 0.1 for 1:100 in mm.
@@ -78,8 +87,10 @@ def simulate(
     use_cpu_devices()
     check_range("--trials", trials, 1, 10**6)
     check_range("--seed", seed, 0, 2**32 - 1)
-    building = read_building(world, path, resolution=resolution, unit=unit, layers=layers)
-    walls, drive = building.world, building.path
+    building = read_building(
+        world, path, drive=drive, resolution=resolution, unit=unit, layers=layers
+    )
+    walls, driven = building.world, building.path
     if building.notes:
         (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
         print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
@@ -93,7 +104,7 @@ def simulate(
     key = jax.random.key(seed)
     with folder(out) as out_dir:
         enable_caches()
-        num_scans = drives.num_scans_of_drive(robot, drive)
+        num_scans = drives.num_scans_of_drive(robot, driven)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,
@@ -101,7 +112,7 @@ def simulate(
                 params,
                 robot,
                 walls,
-                drive,
+                driven,
                 num_trials=trials,
                 num_scans=num_scans,
             )
@@ -113,7 +124,7 @@ def simulate(
             "seconds": seconds,
         }
         true_poses, result = trials_module.replay_trial(
-            key, config, params, robot, walls, drive, trial=0, num_scans=num_scans
+            key, config, params, robot, walls, driven, trial=0, num_scans=num_scans
         )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)

@@ -14,7 +14,8 @@ from jaxslam.core.types import Array
 from jaxslam.io import path_file, world_files
 from jaxslam.io.errors import InputError
 from jaxslam.io.world_files import WorldFile
-from jaxslam.simulation import path_checks, path_following, worlds
+from jaxslam.simulation import named_worlds, path_checks, path_following, worlds
+from jaxslam.simulation.buildings import NAME_FORM, PREFIX
 from jaxslam.simulation.worlds import World
 
 NEAR = 0.2  # [m] of a wall, where many robots do not fit
@@ -39,6 +40,7 @@ def read_building(
     world: str,
     path: Path | None = None,
     *,
+    drive: str | None = None,
     resolution: float | None = None,
     unit: str | None = None,
     layers: tuple[str, ...] = (),
@@ -49,6 +51,7 @@ def read_building(
         world: Name of a built-in world, or a file that `world_files.read_world` reads.
         path: File of waypoints that `path_file.read` reads, in the coordinates of the world's file;
             None for the drive of a built-in world.
+        drive: A drive that is found, of `named_worlds.DRIVES`; None for that of the world.
         resolution: [m] of a pixel, of a picture.
         unit: Of a drawing.
         layers: Of a drawing that are read; empty for all.
@@ -57,18 +60,23 @@ def read_building(
         InputError: There is no such world, a file or option is bad, there is no drive, or it leads
             through walls or out of the building.
     """
-    if world in worlds.NAMES or not world_files.is_world_file(world):
+    if path is not None and drive is not None:
+        raise InputError("is not for a drive that --path gives", field="--drive")
+    is_random = world.startswith(PREFIX)
+    if is_random or world in worlds.NAMES or not world_files.is_world_file(world):
         if resolution is not None or unit is not None or layers:
             names = ("--resolution", "--unit", "--layers")
             given = (resolution is not None, unit is not None, bool(layers))
             field = next(name for name, is_given in zip(names, given, strict=True) if is_given)
             raise InputError(f"is for files; {world!r:.40} is none", field=field)
         with name_errors("--world"):
-            if world not in worlds.NAMES:
-                known = ", ".join(worlds.NAMES)
+            if not is_random and world not in worlds.NAMES:
+                known = ", ".join([*worlds.NAMES, NAME_FORM])
                 raise ValueError(f"no world named {world!r:.40}; there are {known}, and files")
-            building = WorldFile(worlds.named(world), (), np.zeros(2))
-            points = worlds.waypoints(world) if path is None else None
+            building = WorldFile(named_worlds.named_world(world), (), np.zeros(2))
+            if is_random and path is None:
+                drive = drive or "patrol"
+            points = worlds.waypoints(world) if path is None and drive is None else None
     else:
         building = world_files.read_world(world, resolution=resolution, unit=unit, layers=layers)
         points = None
@@ -77,8 +85,14 @@ def read_building(
         points = path_file.read(path) - building.origin
         points = polylines.simplify(points, BEND)
         notes += _check(path, points, building)
+    elif drive is not None:
+        with name_errors("--drive"):
+            found = named_worlds.found_drive(building.world, drive, building.occupancy)
+        walls = World(jnp.asarray(building.world.walls, float))
+        notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
+        return Building(walls, jnp.asarray(found.path, float), tuple(notes))
     elif points is None:
-        advice = "add --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
+        advice = "add --drive patrol, or --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
         raise InputError("is a file, which has no drive of its own", path=world, advice=advice)
     walls = World(jnp.asarray(building.world.walls, float))
     return Building(walls, jnp.asarray(path_following.densify(points), float), tuple(notes))

@@ -27,7 +27,8 @@ WALL_THICKNESS = (0.1, 0.25)  # [m]
 BLOCK_SIDE = (13.0, 18.0)  # [m] of the longest block that no corridor divides
 MIN_BLOCK_SIDE = 5.0  # [m] beside a corridor, but for the first one
 MIN_DEPTH = 2.6  # [m] of the two blocks beside the first corridor
-NAME = re.compile(r"random:(\d+)(?::(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?))?")
+PREFIX = "random:"  # of the names of random buildings
+NAME = re.compile(PREFIX + r"(\d+)(?::(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?))?")
 NAME_FORM = "random:SEED or random:SEED:LENGTHxWIDTH [m], as random:7:40x25"
 
 

@@ -4,8 +4,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from jaxslam.core.maps import OccupancyMap
 from jaxslam.simulation import patrols, worlds
-from jaxslam.simulation.buildings import NAME_FORM, named_building
+from jaxslam.simulation.buildings import NAME_FORM, PREFIX, named_building
 from jaxslam.simulation.path_following import densify
 from jaxslam.simulation.patrols import FoundDrive
 from jaxslam.simulation.worlds import World
@@ -20,7 +21,7 @@ def named_world(name: str) -> World:
     Raises:
         ValueError: There is no world of this name.
     """
-    if name.startswith("random"):
+    if name.startswith(PREFIX):
         return named_building(name).world
     if name not in worlds.NAMES:
         known = ", ".join(worlds.NAMES)
@@ -34,7 +35,7 @@ def named_path(name: str) -> np.ndarray:
     Raises:
         ValueError: There is no world of this name, or it has no drive of its own.
     """
-    if name.startswith("random"):
+    if name.startswith(PREFIX):
         return _patrol_of(name)
     return densify(worlds.waypoints(name))
 
@@ -47,10 +48,11 @@ def _patrol_of(name: str) -> np.ndarray:
     return path
 
 
-def found_drive(world: World, kind: str) -> FoundDrive:
-    """A drive of one of the `DRIVES` in a world.
+def found_drive(world: World, kind: str, occupancy: OccupancyMap | None = None) -> FoundDrive:
+    """A drive of one of the `DRIVES` in a world, and in the map that it was made of, if there is.
 
     Raises:
         ValueError: There is no such kind, or no such drive.
     """
-    return worlds.lookup(DRIVES, kind, "kind of drive")(np.asarray(world.walls, float))
+    find = worlds.lookup(DRIVES, kind, "kind of drive")
+    return find(np.asarray(world.walls, float), occupancy=occupancy)

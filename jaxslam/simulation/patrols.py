@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csgraph, csr_array
 
 from jaxslam.core import polylines
+from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.types import as_float64
 from jaxslam.simulation.medial_graph import medial_graph, room_stops
 from jaxslam.simulation.path_smoothing import PREFERRED, smooth
@@ -47,6 +48,7 @@ def patrol(
     walls: ArrayLike,
     *,
     start: ArrayLike | None = None,
+    occupancy: OccupancyMap | None = None,
     closed: bool = False,
     robot_radius: float = 0.25,
     resolution: float | None = None,
@@ -58,7 +60,9 @@ def patrol(
 
     Args:
         walls: (S, 4) [m] ends x1, y1, x2, y2 of any world, closed or not.
-        start: (2,) [m] where it begins; None: in a room of the main enclosed region.
+        start: (2,) [m] where it begins; None: in a room of the main region that walls enclose.
+        occupancy: The map that the walls were made of, if there is one: the robot stays where it
+            is free.
         closed: Whether it ends where it begins.
         robot_radius: [m] that it keeps from all walls.
         resolution: [m] as of `wall_grid.wall_grid`.
@@ -66,7 +70,7 @@ def patrol(
     Raises:
         ValueError: An argument is not possible, or the robot fits nowhere or not at the start.
     """
-    grid = wall_grid(walls, robot_radius, resolution)
+    grid = wall_grid(walls, robot_radius, resolution, occupancy)
     first = None if start is None else _point("start", start)
     free, notes = choose_region(grid, first)
     stops = room_stops(grid, free)
@@ -91,6 +95,7 @@ def route(
     start: ArrayLike | None = None,
     goal: ArrayLike | None = None,
     *,
+    occupancy: OccupancyMap | None = None,
     robot_radius: float = 0.25,
     resolution: float | None = None,
 ) -> FoundDrive:
@@ -100,7 +105,9 @@ def route(
         walls: (S, 4) [m] ends x1, y1, x2, y2 of any world, closed or not.
         start: (2,) [m] S; None: what is furthest from F.
         goal: (2,) [m] F; None: what is furthest from S. Without both, the two are about as far
-            apart as any in the main enclosed region.
+            apart as any in the main region that walls enclose.
+        occupancy: The map that the walls were made of, if there is one: the robot stays where it
+            is free.
         robot_radius: [m] that it keeps from all walls.
         resolution: [m] as of `wall_grid.wall_grid`.
 
@@ -108,7 +115,7 @@ def route(
         ValueError: An argument is not possible, the robot fits nowhere or not at one of the two
             points, or no path joins them.
     """
-    grid = wall_grid(walls, robot_radius, resolution)
+    grid = wall_grid(walls, robot_radius, resolution, occupancy)
     ends = [None if x is None else _point(n, x) for n, x in (("start", start), ("goal", goal))]
     free, notes = choose_region(grid, ends[1] if ends[0] is None else ends[0])
     cells = [None if x is None else cell_at(grid, x, n) for n, x in zip(_ENDS, ends, strict=True)]

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from jaxslam.core.maps import OccupancyMap, check_occupancy
+from jaxslam.core.se2_np import inverse_transform, transform
 from jaxslam.core.types import as_float64, as_size
 from jaxslam.mapping import medial_axis
 
@@ -30,11 +32,11 @@ class WallGrid(NamedTuple):
     """Walls on H x W cells; i grows with x, j with y.
 
     Attributes:
-        occupied: (H, W) bool, cells that a wall passes through.
+        occupied: (H, W) bool, cells that a wall passes through; those not free in a map, too.
         clearance: (H, W) [m] distance from the centre of a cell to the nearest wall.
         nearest_wall: (2, H, W) int index of the occupied cell that is nearest.
         region: (H, W) int connected region of the cells where the robot fits; 0: it does not fit.
-        outside: Number of the region around all walls.
+        outside: Numbers of the regions around all walls, or at the border of a map.
         samples: Points of the walls.
         spacing: [m] between two samples of a wall, at most.
         resolution: [m] side of a cell.
@@ -46,7 +48,7 @@ class WallGrid(NamedTuple):
     clearance: np.ndarray
     nearest_wall: np.ndarray
     region: np.ndarray
-    outside: int
+    outside: np.ndarray
     samples: cKDTree
     spacing: float
     resolution: float
@@ -63,7 +65,12 @@ class WallGrid(NamedTuple):
         return np.sqrt(np.maximum(distance**2 - (0.5 * self.spacing) ** 2, 0.0))
 
 
-def wall_grid(walls: ArrayLike, robot_radius: float, resolution: float | None = None) -> WallGrid:
+def wall_grid(
+    walls: ArrayLike,
+    robot_radius: float,
+    resolution: float | None = None,
+    occupancy: OccupancyMap | None = None,
+) -> WallGrid:
     """The grid of a world.
 
     Args:
@@ -71,6 +78,8 @@ def wall_grid(walls: ArrayLike, robot_radius: float, resolution: float | None = 
         robot_radius: [m], above 0.
         resolution: [m] side of a cell; None: `RESOLUTION`, less for a small robot, more for a world
             of more than `MAX_CELLS` such cells.
+        occupancy: Map in the frame of the walls: the robot is where it is free, but for unknown
+            islands smaller than the robot. None: it may be anywhere.
 
     Raises:
         ValueError: There is no wall, or an argument has another type, shape or range, or the world
@@ -83,12 +92,16 @@ def wall_grid(walls: ArrayLike, robot_radius: float, resolution: float | None = 
     if not len(segments):
         raise ValueError("walls holds no wall with a length")
     radius = as_size("robot_radius", robot_radius, positive=True)
-    low, high = (f(segments.reshape(-1, 2), axis=0) for f in (np.min, np.max))
+    free = None if occupancy is None else _free_map(check_occupancy(occupancy), radius)
+    edge = np.zeros((0, 2)) if free is None else _edge(free)
+    ends = np.concatenate([segments.reshape(-1, 2), edge])
+    low, high = ends.min(axis=0), ends.max(axis=0)
     size = _cell_size(high - low, radius, resolution)
     need = np.sqrt(radius**2 + 0.5 * size**2 + (0.5 * PATH_SPACING) ** 2)
     margin = need + 3 * size
     shape = np.ceil((high - low + 2 * margin) / size).astype(int)
-    points, corner = _sampled(segments, 0.5 * size), low - margin
+    points = np.concatenate([_sampled(segments, 0.5 * size), edge])
+    corner = low - margin
     occupied = np.zeros(shape, bool)
     occupied[tuple(np.floor((points - corner) / size).astype(int).T)] = True
     distance, nearest = medial_axis.nearest_obstacles(~occupied)
@@ -97,7 +110,7 @@ def wall_grid(walls: ArrayLike, robot_radius: float, resolution: float | None = 
         clearance=distance * size,
         nearest_wall=nearest,
         region=np.zeros(0, int),
-        outside=0,
+        outside=np.zeros(0, int),
         samples=cKDTree(points),
         spacing=0.5 * size,
         resolution=size,
@@ -107,8 +120,44 @@ def wall_grid(walls: ArrayLike, robot_radius: float, resolution: float | None = 
     # A wall is up to 0.71 cells from the centre of its cell: nearer than that, by the samples.
     near = np.nonzero(np.abs(grid.clearance - need) < 0.75 * size)
     grid.clearance[near] = grid.clearances(grid.to_world(np.column_stack(near)))
+    if free is None:
+        region, _ = ndimage.label(grid.clearance >= need, structure=_EIGHT)
+        return grid._replace(region=region, outside=region[:1, 0])
+    kind = _kinds(free, grid.to_world(np.indices(shape).reshape(2, -1).T)).reshape(shape)
+    grid.clearance[kind == 0] = 0.0
     region, _ = ndimage.label(grid.clearance >= need, structure=_EIGHT)
-    return grid._replace(region=region, outside=int(region[0, 0]))
+    at_border = np.unique(region[kind == 2])
+    enclosed = np.setdiff1d(region, [0, *at_border])
+    outside = at_border if len(enclosed) else np.zeros(0, int)
+    return grid._replace(occupied=occupied | (kind == 0), region=region, outside=outside)
+
+
+def _free_map(occupancy: OccupancyMap, radius: float) -> OccupancyMap:
+    """A map whose unknown islands smaller than a robot of a radius [m] are free."""
+    free = medial_axis.free_space(
+        occupancy.occupied,
+        occupancy.free,
+        min_obstacle_size=0.0,
+        min_unknown_size=2 * radius / occupancy.resolution,
+    )
+    return occupancy._replace(free=free)
+
+
+def _edge(free: OccupancyMap) -> np.ndarray:
+    """Centres (P, 2) [m] of the cells beside the free ones of a map, beyond its border, too."""
+    cells = np.pad(free.free, 2)
+    cells = np.argwhere(ndimage.binary_dilation(cells, _EIGHT) & ~cells)
+    return transform(free.origin, (cells - 1.5) * free.resolution)
+
+
+def _kinds(free: OccupancyMap, points: np.ndarray) -> np.ndarray:
+    """For points (N, 2) [m]: 1 where a map is free, 2 where it is at its border, 0 where not."""
+    at = np.floor(inverse_transform(free.origin, points) / free.resolution).astype(int)
+    last = np.array(free.free.shape) - 1
+    inside = np.all((at >= 0) & (at <= last), axis=1)
+    border = np.any((at <= 1) | (at >= last - 1), axis=1)
+    is_free = inside & free.free[tuple(np.clip(at, 0, last).T)]
+    return is_free * np.where(border, 2, 1)
 
 
 def _cell_size(extent: np.ndarray, radius: float, resolution: float | None) -> float:
@@ -163,14 +212,16 @@ def choose_region(grid: WallGrid, start: np.ndarray | None) -> tuple[np.ndarray,
         note = f"chosen: the main region that the walls enclose, {area[chosen]:.1f} m^2"
     else:
         chosen = int(grid.region[tuple(cell_at(grid, start, "start"))])
-        kind = "not enclosed by walls" if chosen == grid.outside else "enclosed by walls"
-        note = f"chosen: the region of the start, {area[chosen]:.1f} m^2, {kind}"
+        kind = "not enclosed by walls" if chosen in grid.outside else "enclosed by walls"
+        note = f"chosen: the region of the given point, {area[chosen]:.1f} m^2, {kind}"
     notes = [f"{note}, for the centre of a robot of {grid.robot_radius:g} m radius"]
-    others = np.delete(enclosed, [0, chosen])
-    if others.max(initial=0.0) >= 1.0:
+    left = np.delete(enclosed, [0, chosen])
+    if left.max(initial=0.0) >= 1.0:
+        count = int(np.sum(left >= 1.0))
+        regions = "region" if count == 1 else "regions"
         notes.append(
-            f"left out: {int(np.sum(others >= 1.0))} more enclosed regions of 1 m^2 or more, the "
-            f"largest of {others.max():.1f} m^2"
+            f"left out: {count} more enclosed {regions} of 1 m^2 or more, the largest of "
+            f"{left.max():.1f} m^2"
         )
     if grid.resolution > RESOLUTION:
         notes.append(f"cells of {grid.resolution:.2g} m: narrow passages may be missed")

@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 from scipy.sparse import csgraph, csr_array
 
+from jaxslam.core.maps import OccupancyMap
 from jaxslam.simulation import arguments, drives, named_worlds, wall_grid, worlds
 from jaxslam.simulation.buildings import building
 from jaxslam.simulation.patrols import patrol, route
@@ -164,7 +165,7 @@ def test_a_passage_is_passed_if_the_robot_fits_and_not_if_it_does_not():
     assert clearance(between(found.path), rooms_with_passage(0.56)).min() >= RADIUS
     with pytest.raises(ValueError, match=r"goal \(8, 3\) cannot be reached from start \(1, 3\)"):
         route(rooms_with_passage(0.49), (1.0, 3.0), (8.0, 3.0))
-    assert "more enclosed regions" in patrol(rooms_with_passage(0.49, 5.0)).notes[1]
+    assert "1 more enclosed region" in patrol(rooms_with_passage(0.49, 5.0)).notes[1]
 
 
 def test_the_inside_of_a_thick_wall_is_not_free():
@@ -185,6 +186,54 @@ def test_an_open_world_needs_a_start():
     assert clearance(between(found.path), OPEN).min() >= RADIUS
     goal = route(OPEN, (0.5, 0.0), (5.5, 0.0))
     assert 5.0 <= goal.length < 5.3
+
+
+def map_of_an_open_plan():
+    """Walls of two rooms with an exit, open to the outside, and a map that is free inside."""
+    free_boxes = [(0, 0, 4, 4), (4, 1, 4.5, 2), (4.5, 0, 9, 4), (2, 4, 3, 4.5)]
+    cell, origin = 0.05, np.array([-1.0, -1.0, 0.0])
+    centre = np.stack(np.indices((220, 140)), axis=-1) * cell + cell / 2 - 1.0
+    free = np.zeros(centre.shape[:2], bool)
+    for box in free_boxes:
+        free |= ((centre > box[:2]) & (centre < box[2:])).all(axis=-1)
+    walls = outline(free_boxes)
+    walls = walls[~(walls[:, [1, 3]] == 4.5).all(axis=1)]  # the exit has no door
+    occupied = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
+    free[60:62, 60:62] = False  # an island that no beam has passed
+    return walls, OccupancyMap(occupied, free, cell, origin)
+
+
+def test_a_robot_stays_where_a_map_is_free():
+    walls, occupancy = map_of_an_open_plan()
+    with pytest.raises(ValueError, match="walls enclose no free space"):
+        patrol(walls)
+    found = patrol(walls, occupancy=occupancy)
+    assert visited(found.path, np.array([(0, 0, 4, 4), (4.5, 0, 9, 4)])).all()
+    assert found.path.min() > RADIUS and found.path[:, 0].max() < 8.75
+    assert found.path[:, 1].max() < 4.3  # the map ends behind the exit
+    assert clearance(between(found.path), walls).min() >= RADIUS
+    whole = occupancy._replace(occupied=occupancy.occupied & False, free=occupancy.free | True)
+    found = patrol(walls, occupancy=whole)  # nothing is enclosed but by the border of the map
+    assert clearance(between(found.path), walls).min() >= RADIUS
+    with pytest.raises(ValueError, match="occupancy is int, not OccupancyMap"):
+        patrol(walls, occupancy=3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_distances_on_the_grid_are_never_too_large_where_they_decide(seed):
+    """Walls at random angles; the robot fits where it does by exact distances, to half a cell."""
+    rng = np.random.default_rng(seed)
+    walls = rng.uniform(0, 6, (12, 4))
+    found = wall_grid.wall_grid(walls, RADIUS)
+    cells = np.indices(found.region.shape).reshape(2, -1).T
+    exact = clearance(found.to_world(cells), walls)
+    fits = found.region.ravel() > 0
+    assert exact[fits].min() >= RADIUS
+    assert np.all(fits[exact >= RADIUS + 0.005])
+    points = rng.uniform(0, 6, (500, 2))
+    exact = clearance(points, walls)
+    assert np.all(found.clearances(points) <= exact + 1e-12)
+    assert np.all(found.clearances(points)[exact > 0.1] >= exact[exact > 0.1] - 0.002)
 
 
 def test_large_worlds_have_larger_cells_and_say_so(monkeypatch):

@@ -142,6 +142,13 @@ def test_a_route_is_hardly_longer_than_the_shortest_path(seed):
     assert clearance(between(found.path), walls).min() >= RADIUS
 
 
+def test_a_route_takes_a_narrow_passage_rather_than_a_long_detour():
+    walls = outline([(0, 0, 4, 8), (4, 1, 6, 1.56), (4, 6, 6, 8), (6, 0, 10, 8)])
+    found = route(walls, (3.0, 1.3), (7.0, 1.3))
+    assert found.length < 1.1 * 4.0
+    assert clearance(between(found.path), walls).min() >= RADIUS
+
+
 def test_a_route_without_ends_is_about_as_long_as_any():
     walls = building(0, SMALL).world.walls
     found = route(walls)
@@ -303,6 +310,25 @@ def test_a_visiting_order_is_nearly_the_shortest(seed, closed, first):
     every = [p for p in permutations(range(7)) if not first or p[0] == 0]
     best = min(length((*p, p[0]) if closed else p) for p in every)
     assert best - 1e-12 <= length(order) <= 1.05 * best
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_no_turn_of_a_part_and_no_move_of_a_place_makes_an_order_shorter(closed):
+    points = np.random.default_rng(5).uniform(size=(40, 2))
+    distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    order = visiting_order(distance, closed=closed, first=False)
+
+    def length(order):
+        return sum(distance[pair] for pair in pairwise(order))
+
+    least = length(order) - 1e-9
+    low, high = (1, 40) if closed else (0, 40)
+    for i in range(low, high):
+        for j in range(i + 1, high):
+            assert length([*order[:i], *order[i : j + 1][::-1], *order[j + 1 :]]) > least
+        rest = [*order[:i], *order[i + 1 :]]
+        for j in range(low, high):
+            assert length([*rest[:j], order[i], *rest[j:]]) > least
 
 
 def test_a_visiting_order_goes_round_a_circle():

@@ -1,5 +1,6 @@
 """Worlds and drives by name: those of `worlds`, random buildings, and drives that are found."""
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxslam.simulation.path_following import densify
 from jaxslam.simulation.patrols import FoundDrive
 from jaxslam.simulation.worlds import World
 
-DRIVES = {"patrol": patrols.patrol, "route": patrols.route}
+DRIVES: dict[str, Callable[..., FoundDrive]] = {"patrol": patrols.patrol, "route": patrols.route}
 """What finds a drive in any world, by name."""
 
 

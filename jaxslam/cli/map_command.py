@@ -9,7 +9,13 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import map_files, room_results, summaries
-from jaxslam.cli.options import OutFolder, check_range, name_errors, require_other_folder
+from jaxslam.cli.options import (
+    OptionalLength,
+    OutFolder,
+    check_range,
+    name_errors,
+    require_other_folder,
+)
 from jaxslam.core.maps import MAX_RESOLUTION, MIN_RESOLUTION, OccupancyMap
 from jaxslam.evaluation import map_metrics
 from jaxslam.io import geojson, graphml, pictures, ros_map
@@ -20,9 +26,6 @@ from jaxslam.mapping import grid_topology
 from jaxslam.mapping.planner_data import planner_data
 
 MIN_REGION_AREA = 1.0  # [m^2] of the smallest region that `map --regions all` keeps
-
-OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="")]
-"""Option that is a length [m], or not given."""
 
 
 def map_occupancy(

@@ -15,6 +15,9 @@ OptionalFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavio
 OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 """Option that is a whole number, or not given."""
 
+OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="")]
+"""Option that is a length [m], or not given."""
+
 OptionalTopic = Annotated[str | None, tyro.conf.arg(metavar="TOPIC", help_behavior_hint="")]
 """Option that names a topic of a bag, or none."""
 

@@ -2,17 +2,18 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
 from jaxslam.cli.log_options import read_params
-from jaxslam.cli.options import OptionalFile, OutFolder, check_range, name_errors
+from jaxslam.cli.options import OptionalFile, OptionalLength, OutFolder, check_range, name_errors
 from jaxslam.cli.stopwatch import stopwatch
+from jaxslam.cli.world_options import read_building
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.types import JUNCTION
@@ -23,14 +24,29 @@ from jaxslam.io.output import folder
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.simulation import drives, kinematics, path_following, worlds
+from jaxslam.simulation import drives, kinematics
 from jaxslam.simulation import trials as trials_module
 from jaxslam.simulation.robot import Robot
-from jaxslam.simulation.worlds import World
+
+OptionalUnit = Annotated[str | None, tyro.conf.arg(metavar="UNIT", help_behavior_hint="")]
+"""Option that is a unit of length, or not given."""
+
+OptionalDrive = Annotated[
+    Literal["patrol", "route"] | None, tyro.conf.arg(metavar="KIND", help_behavior_hint="")
+]
+"""Option that names a kind of drive, or none."""
+
+Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")]
+"""Option that names layers of a drawing, or none."""
 
 
 def simulate(
-    world: str = "office",
+    world: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "office",
+    path: OptionalFile = None,
+    drive: OptionalDrive = None,
+    resolution: OptionalLength = None,
+    unit: OptionalUnit = None,
+    layers: Layers = (),
     trials: int = 100,
     seed: int = 0,
     noise: OptionalFile = None,
@@ -45,7 +61,19 @@ def simulate(
     errors.png of trial 0, whose time stamps are the scan numbers.
 
     Args:
-        world: World with a path from S to F: office.
+        world: World with a path from S to F: office; random:SEED or random:SEED:40x25 [m], a random
+            building, which is patrolled; or a file: ROS map (.yaml), picture of a plan (.png, .pgm,
+            ..., with --resolution), GeoJSON, CSV of walls x1,y1,x2,y2, SVG or DXF (both need the
+            extra [cad]).
+        path: File of the waypoints that straight lines join, in the coordinates of the world's
+            file, in metres: CSV of x,y, or GeoJSON of one LineString; a file has no path of its
+            own.
+        drive: A drive that is found instead of `--path`, in any world: patrol through all rooms,
+            or route between two of its ends that are far apart.
+        resolution: Side of a pixel [m] of a picture.
+        unit: Unit of a drawing where its file states none: m, cm, mm, in, ft, or the metres of a
+            unit, as 0.1 for 1:100 in mm.
+        layers: Layers of a drawing whose lines are walls; by default all that are visible.
         trials: Number of trials.
         seed: Random seed of the odometry and range noise.
         noise: File of the noise parameters of the filter (Q and R); by default those of the
@@ -61,27 +89,33 @@ def simulate(
     use_cpu_devices()
     check_range("--trials", trials, 1, 10**6)
     check_range("--seed", seed, 0, 2**32 - 1)
-    with name_errors("--world"):
-        walls = World(jnp.asarray(worlds.named(world).walls, float))
-        path = jnp.asarray(path_following.densify(worlds.waypoints(world)), float)
+    building = read_building(
+        world, path, drive=drive, resolution=resolution, unit=unit, layers=layers
+    )
+    walls, points = building.world, building.path
+    if building.notes:
+        (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
+        print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
+    for note in building.notes:
+        print(f"note: {note}", flush=True)
     config = Config(frontend=FrontendConfig(labels=labels))
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
-    driven, config = _robot(robot, config)
-    params = read_params(noise, kinematics.noise_params(driven))
+    simulated, config = _robot(robot, config)
+    params = read_params(noise, kinematics.noise_params(simulated))
     key = jax.random.key(seed)
     with folder(out) as out_dir:
         enable_caches()
         with name_errors("--robot"):
-            num_scans = drives.num_scans_of_drive(driven, path)
+            num_scans = drives.num_scans_of_drive(simulated, points)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,
                 config,
                 params,
-                driven,
+                simulated,
                 walls,
-                path,
+                points,
                 num_trials=trials,
                 num_scans=num_scans,
             )
@@ -93,7 +127,7 @@ def simulate(
             "seconds": seconds,
         }
         true_poses, result = trials_module.replay_trial(
-            key, config, params, driven, walls, path, trial=0, num_scans=num_scans
+            key, config, params, simulated, walls, points, trial=0, num_scans=num_scans
         )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)

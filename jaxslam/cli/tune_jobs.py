@@ -26,7 +26,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.stacking import stack_episodes
-from jaxslam.simulation import drives, path_following, trials, worlds
+from jaxslam.simulation import drives, named_worlds, trials
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 from jaxslam.tuning import losses
@@ -95,8 +95,8 @@ def simulated_task(
 ) -> TuneTask:
     """Check the options of a tuning on simulated trials."""
     with name_errors("--world"):
-        walls = World(jnp.asarray(worlds.named(world).walls, float))
-        path = jnp.asarray(path_following.densify(worlds.waypoints(world)), float)
+        walls = World(jnp.asarray(named_worlds.named_world(world).walls, float))
+        path = jnp.asarray(named_worlds.named_path(world), float)
     params = read_params(noise, NoiseParams.for_laser_log())
 
     def load() -> TuneJob:

@@ -7,6 +7,8 @@ from jaxslam.core import polylines
 
 TOLERANCE = 1.0  # [cells] of a polygon
 APART = 0.1  # [cells] between two sides of polygons, more than
+MOVES = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+"""Steps (4, 2) [cells] along the sides of a cell, each turned left from the one before."""
 POCKET = 2  # [cells] width and height of a hole between cells that meet in a corner, left out
 _PINCH = 0.25  # [cells] by which a hole ends before a corner that it would share
 _BLOCK = 256  # sides that are compared at once
@@ -33,17 +35,16 @@ def outlines(label: np.ndarray, count: int) -> list[list[np.ndarray]]:
     return found
 
 
-def _boundaries(cells: np.ndarray) -> list[np.ndarray]:
-    """Corners (n, 2) of the boundaries of connected cells (H, W) bool; the border is not set.
+def boundary_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sides of cells (H, W) bool whose neighbour is not set; the border is not set.
 
-    The first is the outer one. Each side of a cell whose neighbour is not set is an edge with the
-    cell on its left. Where two cells meet in a corner alone, boundaries pass between them, so that
-    none meets itself, and holes end `_PINCH` before that corner:
+    Each has its cell on its left. Where two cells meet in a corner alone, sides follow each other
+    from the one cell to the other.
 
-        # .         a turn to the right wherever there is a choice
-        . #
+    Returns:
+        Of each of E sides its direction (E,), an index of `MOVES`, ascending; the corner (E, 2)
+        where it starts; and the index (E,) of the side that follows it.
     """
-    moves = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # each turned left from the one before
     beside = ((0, -1), (1, 0), (0, 1), (-1, 0))  # neighbour on the right of each edge
     starts = ((0, 0), (1, 0), (1, 1), (0, 1))  # corner of the cell where it begins
     edges = []
@@ -61,15 +62,29 @@ def _boundaries(cells: np.ndarray) -> list[np.ndarray]:
         found = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
         return np.where(key[found] == wanted, found, -1)
 
-    ends = np.stack([rows, columns], axis=1) + moves[turns]
+    ends = np.stack([rows, columns], axis=1) + MOVES[turns]
     follower = np.full(len(turns), -1)
     for change in (1, 0, -1):  # left, straight on, right: the last one found is taken
         nxt = number((turns + change) % 4, *ends.T)
         follower = np.where(nxt >= 0, nxt, follower)
+    return turns, np.stack([rows, columns], axis=1), follower
+
+
+def _boundaries(cells: np.ndarray) -> list[np.ndarray]:
+    """Corners (n, 2) of the boundaries of connected cells (H, W) bool; the border is not set.
+
+    The first is the outer one. Each side of a cell whose neighbour is not set is an edge with the
+    cell on its left. Where two cells meet in a corner alone, boundaries pass between them, so that
+    none meets itself, and holes end `_PINCH` before that corner:
+
+        # .         a turn to the right wherever there is a choice
+        . #
+    """
+    turns, starts, follower = boundary_edges(cells)
     start = int(np.searchsorted(turns, 3))  # of the first cell, which has no neighbour before it
-    corners = np.stack([rows, columns], axis=1).astype(float)
+    corners = starts.astype(float)
     following = follower.tolist()
-    corner = np.ravel_multi_index((rows, columns), shape[1:])
+    corner = np.ravel_multi_index(tuple(starts.T), (cells.shape[0] + 1, cells.shape[1] + 1))
     is_pinch = np.bincount(corner)[corner] > 1
     waiting = dict.fromkeys([start, *range(len(turns))])
     found: list[np.ndarray] = []
@@ -85,7 +100,7 @@ def _boundaries(cells: np.ndarray) -> list[np.ndarray]:
         if found and pinched.any():
             if np.ptp(ring, axis=0).max() <= POCKET:
                 continue
-            ring = ring + _PINCH * pinched[:, None] * (moves[turns[loop]] - moves[before])
+            ring = ring + _PINCH * pinched[:, None] * (MOVES[turns[loop]] - MOVES[before])
         found.append(ring[is_corner])
     return found
 

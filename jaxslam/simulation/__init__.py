@@ -1,5 +1,6 @@
 """Simulated worlds, robots, scans and drives, and Monte-Carlo trials of them."""
 
+from jaxslam.simulation.buildings import building as building
 from jaxslam.simulation.discs import Discs as Discs
 from jaxslam.simulation.drives import drive as drive
 from jaxslam.simulation.drives import num_scans_of_drive as num_scans_of_drive
@@ -10,6 +11,8 @@ from jaxslam.simulation.life import Life as Life
 from jaxslam.simulation.life import life_in as life_in
 from jaxslam.simulation.path_following import densify as densify
 from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
+from jaxslam.simulation.patrols import patrol as patrol
+from jaxslam.simulation.patrols import route as route
 from jaxslam.simulation.range_errors import RangeErrors as RangeErrors
 from jaxslam.simulation.ray_casting import Hits as Hits
 from jaxslam.simulation.ray_casting import add_range_noise as add_range_noise

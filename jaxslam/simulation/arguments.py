@@ -12,9 +12,9 @@ import numpy as np
 from jaxslam.core.arguments import as_float
 from jaxslam.core.scan import Lidar
 from jaxslam.core.types import Array
-from jaxslam.simulation import worlds
+from jaxslam.simulation import named_worlds, worlds
 from jaxslam.simulation.kinematics import KINEMATICS, turning_radius
-from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW, densify
+from jaxslam.simulation.path_following import LOOKAHEAD, SEARCH_WINDOW
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.scanners import Scanner, check_scanner
 from jaxslam.simulation.worlds import World, with_index
@@ -150,7 +150,8 @@ def as_world(world: Any, range_max: float) -> World:
         ValueError: There is no world of this name, or the walls are not (S, 4) finite numbers.
     """
     if isinstance(world, str):
-        return with_index(World(jnp.asarray(worlds.named(world).walls, float)), range_max)
+        walls = jnp.asarray(named_worlds.named_world(world).walls, float)
+        return with_index(World(walls), range_max)
     if not isinstance(world, World):
         raise ValueError(
             f"world is {type(world).__name__}, not World or one of the names "
@@ -166,7 +167,7 @@ def as_path(path: Any, world: Any) -> Array:
     """A path (N, 2) [m] in JAX's precision.
 
     Args:
-        path: Its points; None for the drive that belongs to the world.
+        path: Its points; None for the drive of the world: its own, a patrol in a random building.
         world: Name of the world, or `World`.
 
     Raises:
@@ -175,8 +176,11 @@ def as_path(path: Any, world: Any) -> Array:
     """
     if path is None:
         if not isinstance(world, str):
-            raise ValueError("path is None; a world without a name has no drive of its own")
-        return jnp.asarray(densify(worlds.waypoints(world)), float)
+            raise ValueError(
+                "path is None; a world without a name has no drive of its own: find one with "
+                "jaxslam.simulation.patrols"
+            )
+        return jnp.asarray(named_worlds.named_path(world), float)
     points = as_float("path", path, ("N", 2))
     check_path(points)
     if not np.isfinite(points).all():

@@ -58,10 +58,12 @@ def _indexed(walls: bytes, range_max: float, dtype: np.dtype) -> WallIndex:
 
 
 def covers(boxes: Sequence[Box], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether each point (x, y) of a grid is in one of the boxes: (len(x), len(y)) bool."""
+    """Which points of a grid are in a box: (len(x), len(y)) bool, of ascending x and y."""
     inside = np.zeros((len(x), len(y)), bool)
     for x0, y0, x1, y1 in boxes:
-        inside |= ((x0 < x) & (x < x1))[:, None] & ((y0 < y) & (y < y1))
+        columns = slice(np.searchsorted(x, x0, "right"), np.searchsorted(x, x1, "left"))
+        rows = slice(np.searchsorted(y, y0, "right"), np.searchsorted(y, y1, "left"))
+        inside[columns, rows] = True
     return inside
 
 
@@ -81,8 +83,8 @@ def outline(free: Sequence[Box], solid: Sequence[Box] = ()) -> np.ndarray:
     x, y = np.unique(boxes[:, [0, 2]]), np.unique(boxes[:, [1, 3]])
     middle_x, middle_y = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
     inside = covers(free, middle_x, middle_y) & ~covers(solid, middle_x, middle_y)
-    change_x = np.diff(np.pad(inside, 1).astype(int), axis=0)[:, 1:-1]  # across the lines x
-    change_y = np.diff(np.pad(inside, 1).astype(int), axis=1)[1:-1]  # across the lines y
+    change_x = np.diff(np.pad(inside, 1).astype(np.int8), axis=0)[:, 1:-1]  # across the lines x
+    change_y = np.diff(np.pad(inside, 1).astype(np.int8), axis=1)[1:-1]  # across the lines y
     walls = []
     for sign in (1, -1):
         for at, change in zip(x, change_x, strict=True):

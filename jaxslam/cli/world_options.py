@@ -1,0 +1,128 @@
+"""The building and the drive of `jaxslam simulate`, from its options."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.cli.options import name_errors
+from jaxslam.core import polylines
+from jaxslam.core.maps import OccupancyMap
+from jaxslam.core.se2_np import inverse_transform
+from jaxslam.core.types import Array
+from jaxslam.io import path_file, world_files
+from jaxslam.io.errors import InputError
+from jaxslam.io.world_files import WorldFile
+from jaxslam.simulation import named_worlds, path_checks, path_following, worlds
+from jaxslam.simulation.buildings import NAME_FORM, PREFIX
+from jaxslam.simulation.worlds import World
+
+NEAR = 0.2  # [m] of a wall, where many robots do not fit
+BEND = 0.01  # [m] by which waypoints are off the path that is driven
+
+
+class Building(NamedTuple):
+    """What is driven through, and where.
+
+    Attributes:
+        world: Walls, in JAX's precision.
+        path: (N, 2) [m, world frame] points of the drive.
+        notes: What was assumed, left out or found.
+    """
+
+    world: World
+    path: Array
+    notes: tuple[str, ...]
+
+
+def read_building(
+    world: str,
+    path: Path | None = None,
+    *,
+    drive: str | None = None,
+    resolution: float | None = None,
+    unit: str | None = None,
+    layers: tuple[str, ...] = (),
+) -> Building:
+    """The building of `--world` and the drive of `--path`.
+
+    Args:
+        world: Name of a built-in world, or a file that `world_files.read_world` reads.
+        path: File of waypoints that `path_file.read` reads, in the coordinates of the world's file;
+            None for the drive of a built-in world.
+        drive: A drive that is found, of `named_worlds.DRIVES`; None for that of the world.
+        resolution: [m] of a pixel, of a picture.
+        unit: Of a drawing.
+        layers: Of a drawing that are read; empty for all.
+
+    Raises:
+        InputError: There is no such world, a file or option is bad, there is no drive, or it leads
+            through walls or out of the building.
+    """
+    if path is not None and drive is not None:
+        raise InputError("is not for a drive that --path gives", field="--drive")
+    is_random = world.startswith(PREFIX)
+    if is_random or world in worlds.NAMES or not world_files.is_world_file(world):
+        if resolution is not None or unit is not None or layers:
+            names = ("--resolution", "--unit", "--layers")
+            given = (resolution is not None, unit is not None, bool(layers))
+            field = next(name for name, is_given in zip(names, given, strict=True) if is_given)
+            raise InputError(f"is for files; {world!r:.40} is none", field=field)
+        with name_errors("--world"):
+            if not is_random and world not in worlds.NAMES:
+                known = ", ".join([*worlds.NAMES, NAME_FORM])
+                raise ValueError(f"no world named {world!r:.40}; there are {known}, and files")
+            building = WorldFile(named_worlds.named_world(world), (), np.zeros(2))
+            if is_random and path is None:
+                drive = drive or "patrol"
+            points = worlds.waypoints(world) if path is None and drive is None else None
+    else:
+        building = world_files.read_world(world, resolution=resolution, unit=unit, layers=layers)
+        points = None
+    notes = [*building.notes]
+    if path is not None:
+        points = path_file.read(path) - building.origin
+        points = polylines.simplify(points, BEND)
+        notes += _check(path, points, building)
+    elif drive is not None:
+        with name_errors("--drive"):
+            found = named_worlds.found_drive(building.world, drive, building.occupancy)
+        walls = World(jnp.asarray(building.world.walls, float))
+        notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
+        return Building(walls, jnp.asarray(found.path, float), tuple(notes))
+    elif points is None:
+        advice = "add --drive patrol, or --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
+        raise InputError("is a file, which has no drive of its own", path=world, advice=advice)
+    walls = World(jnp.asarray(building.world.walls, float))
+    return Building(walls, jnp.asarray(path_following.densify(points), float), tuple(notes))
+
+
+def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
+    """Notes on a drive along waypoints (K, 2) [m, world frame]; InputError if there can be none."""
+    x, y = building.origin
+    about = f"{file}" if not building.origin.any() else f"{file} (less x {x:.0f}, y {y:.0f} m)"
+    if building.occupancy is not None:
+        kind = _kind_of_cell(building.occupancy, points[0])
+        if kind != "free":
+            x, y = points[0]
+            problem = f"starts at x {x:.2f}, y {y:.2f} m, where the map is {kind}"
+            raise InputError(problem, path=about, advice="start in free space")
+    with name_errors(about):
+        found = path_checks.check_path_in_world(points, building.world)
+    notes = []
+    if found.clearance < NEAR:
+        notes.append(f"the path comes within {found.clearance:.2f} m of a wall")
+    if found.open_share > 0.0:
+        notes.append(f"{found.open_share:.1%} of the beams along the path meet no wall")
+    return notes
+
+
+def _kind_of_cell(occupancy: OccupancyMap, point: np.ndarray) -> str:
+    """What a map has at a point (2,): free, occupied, unknown, or nothing outside of it."""
+    cell = np.floor(inverse_transform(occupancy.origin, point) / occupancy.resolution).astype(int)
+    if (cell < 0).any() or (cell >= occupancy.free.shape).any():
+        return "left"
+    if occupancy.occupied[tuple(cell)]:
+        return "occupied"
+    return "free" if occupancy.free[tuple(cell)] else "unknown"

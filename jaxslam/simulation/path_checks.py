@@ -1,0 +1,111 @@
+"""Whether a path can be driven in a world: it crosses no wall, and does not leave the building."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.core import polylines
+from jaxslam.core.types import as_float64
+from jaxslam.simulation.ray_casting import SEAM
+from jaxslam.simulation.worlds import World
+
+OPEN = 0.5  # of the directions around a point that meet no wall: it is outside
+NUM_POINTS, NUM_BEAMS = 100, 60  # that are tried along a path
+_BLOCK = 2**20  # pairs of legs and walls at once
+
+
+class PathCheck(NamedTuple):
+    """What was found along a path.
+
+    Attributes:
+        clearance: [m] between the path and the nearest wall.
+        open_share: Share of the beams around the path that meet no wall, whatever their range.
+    """
+
+    clearance: float
+    open_share: float
+
+
+def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
+    """Check that a path can be driven by a robot without a size.
+
+    Outside is where half of all directions or more meet no wall: so it is beyond the walls, as all
+    of them are on one side there.
+
+    Args:
+        path: (K >= 2, 2) [m, world frame] waypoints that straight lines join.
+        world: The building.
+
+    Raises:
+        ValueError: A leg of the path meets a wall, or a point of it is outside; the message says
+            where.
+    """
+    path, walls = as_float64("path", path, ("K", 2)), as_float64("walls", world.walls, ("S", 4))
+    count = max(2, min(NUM_POINTS, int(np.ceil(float(polylines.length(path))))))
+    points = np.concatenate([path[:1], polylines.resample(path, count)[1:]])
+    share = np.array([_open_share(walls, point) for point in points])
+    if (share >= OPEN).any():
+        first = int((share >= OPEN).argmax())
+        x, y = points[first]
+        place = "starts" if first == 0 else "leaves the building"
+        raise ValueError(
+            f"path {place} at x {x:.2f}, y {y:.2f} m, from where {share[first]:.0%} of the "
+            "directions meet no wall: it is outside"
+        )
+    clearance = np.inf
+    block = max(1, _BLOCK // len(walls))
+    for top in range(0, len(path) - 1, block):
+        legs = np.hstack([path[:-1], path[1:]])[top : top + block]
+        crosses, distance = _legs_and_walls(legs, walls)
+        if crosses.any():
+            leg, wall = np.argwhere(crosses)[0]
+            x, y = _crossing(legs[leg], walls[wall])
+            raise ValueError(
+                f"path goes through a wall at x {x:.2f}, y {y:.2f} m, from waypoint "
+                f"{top + leg + 1} to {top + leg + 2}"
+            )
+        clearance = min(clearance, float(distance.min()))
+    return PathCheck(clearance, float(share.mean()))
+
+
+def _open_share(walls: np.ndarray, point: np.ndarray) -> float:
+    """Share of the directions around a point (2,) that meet none of the walls (S, 4)."""
+    angle = 2.0 * np.pi / NUM_BEAMS * (np.arange(NUM_BEAMS) + 0.5)
+    beam = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
+    start, along = walls[:, :2] - point, walls[:, 2:] - walls[:, :2]
+    slope = _cross(beam, along)
+    safe = np.where(np.abs(slope) > 1e-12, slope, 1.0)
+    fraction, distance = _cross(start, beam) / safe, _cross(start, along) / safe
+    met = (np.abs(slope) > 1e-12) & (distance > 0.0) & (np.abs(fraction - 0.5) <= 0.5 + SEAM)
+    return 1.0 - float(met.any(axis=1).mean())
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product (...) of vectors (..., 2)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _legs_and_walls(legs: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether legs (K, 4) and walls (S, 4) meet, (K, S), and the distance between them if not."""
+    a, b = legs[:, None, :2], legs[:, None, 2:]
+    c, d = walls[None, :, :2], walls[None, :, 2:]
+    sides = _cross(b - a, c - a) * _cross(b - a, d - a), _cross(d - c, a - c) * _cross(d - c, b - c)
+    ends = (_distance(a, c, d), _distance(b, c, d), _distance(c, a, b), _distance(d, a, b))
+    distance = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
+    return ((sides[0] < 0.0) & (sides[1] < 0.0)) | (distance <= 0.0), distance
+
+
+def _distance(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distance (...) of points from segments."""
+    step = end - start
+    share = ((point - start) * step).sum(axis=-1) / np.maximum((step**2).sum(axis=-1), 1e-18)
+    near = start + np.clip(share, 0.0, 1.0)[..., None] * step
+    return np.asarray(np.hypot(*np.moveaxis(point - near, -1, 0)))
+
+
+def _crossing(leg: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """Point (2,) where a leg (4,) and a wall (4,) meet; the leg's start where they are parallel."""
+    along, across = leg[2:] - leg[:2], wall[2:] - wall[:2]
+    slope = float(_cross(along, across))
+    share = float(_cross(wall[:2] - leg[:2], across)) / slope if slope else 0.0
+    return np.asarray(leg[:2] + min(max(share, 0.0), 1.0) * along)

@@ -34,7 +34,8 @@ NOT_PRINTED = "defpoints"  # layer of the points that dimensions refer to
 MAX_DEPTH = 32  # of blocks in blocks
 ARC_SEGMENTS = 64  # of a full circle, of a polyline with a width
 FLAT_Z = 1e-6  # [units] of heights that differ
-BROKEN = (OSError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, EOFError)
+BROKEN = (OSError, EOFError, ValueError, TypeError, AttributeError, LookupError)
+BROKEN += (ArithmeticError, AssertionError, RuntimeError)
 """What a reader raises for a broken file, besides its own errors."""
 ADVICE = "save it as DXF again (AutoCAD 2000 or later)"
 

@@ -34,8 +34,10 @@ NOT_PRINTED = "defpoints"  # layer of the points that dimensions refer to
 MAX_DEPTH = 32  # of blocks in blocks
 ARC_SEGMENTS = 64  # of a full circle, of a polyline with a width
 FLAT_Z = 1e-6  # [units] of heights that differ
-BROKEN = (OSError, EOFError, ValueError, TypeError, AttributeError, LookupError)
-BROKEN += (ArithmeticError, AssertionError, RuntimeError)
+BROKEN = (
+    *(OSError, EOFError, ValueError, TypeError, AttributeError, LookupError),
+    *(ArithmeticError, AssertionError, RuntimeError),
+)
 """What a reader raises for a broken file, besides its own errors."""
 ADVICE = "save it as DXF again (AutoCAD 2000 or later)"
 

@@ -163,7 +163,8 @@ def _split(moments: _Moments, breaks: list[int]) -> list[int]:
 def _furthest(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[int, float]:
     """Which of the points (n, 2) but the first and last is furthest from a side, and how far."""
     step, offset = end - start, points[1:-1] - start
-    share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+    share = offset @ step / max(float(step @ step), 1e-12)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
     distance = np.hypot(*(offset - share[:, None] * step).T)
     furthest = int(distance.argmax())
     return 1 + furthest, float(distance[furthest])

@@ -1,6 +1,5 @@
 """Walls as lines of a DXF drawing; needs the extra `[cad]`, for ezdxf."""
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -33,8 +32,13 @@ NAMES |= {"MPOLYGON": "hatches", "DIMENSION": "dimensions", "LEADER": "leaders",
 NAMES |= {"MULTILEADER": "leaders", "ARC_DIMENSION": "dimensions", "IMAGE": "images"}
 NOT_PRINTED = "defpoints"  # layer of the points that dimensions refer to
 MAX_DEPTH = 32  # of blocks in blocks
-MAX_SEGMENT_TURN = math.pi / 32  # [rad] of a polyline's wide arcs
+ARC_SEGMENTS = 64  # of a full circle, of a polyline with a width
 FLAT_Z = 1e-6  # [units] of heights that differ
+BROKEN = (
+    *(OSError, EOFError, ValueError, TypeError, AttributeError, LookupError),
+    *(ArithmeticError, AssertionError, RuntimeError),
+)
+"""What a reader raises for a broken file, besides its own errors."""
 ADVICE = "save it as DXF again (AutoCAD 2000 or later)"
 
 
@@ -75,24 +79,17 @@ def read(path: Path, unit: str | float | None = None, layers: Sequence[str] = ()
         raise InputError("is a DWG file", path=path, advice="save it as DXF in your CAD program")
     if not head.startswith(b"AutoCAD Binary DXF") and b"SECTION" not in head:
         raise InputError("is no DXF file", path=path, advice=ADVICE)
+    found = _Found()
     try:
         document, auditor = recover.readfile(path)
-    except (
-        ezdxf.DXFError,
-        OSError,
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        EOFError,
-    ) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"is no DXF that can be read ({reason})", path=path, advice=ADVICE
-        ) from None
-    size, notes = _unit(path, document, unit)
-    found = _Found()
-    _read_entities(found, document, document.modelspace(), CURVE_TOLERANCE / size, "", 0)
+        size, notes = _unit(path, document, unit)
+        _read_entities(found, document, document.modelspace(), CURVE_TOLERANCE / size, "", 0)
+    except InputError:
+        raise
+    except (ezdxf.DXFError, *BROKEN) as error:
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        problem = f"is no DXF that can be read ({reason})"
+        raise InputError(problem, path=path, advice=ADVICE) from None
     counted: Counter[str] = Counter()
     for layer, line in found.lines:
         counted[layer] += len(line) - 1
@@ -128,7 +125,7 @@ def _unit(path: Path, document: Any, unit: str | float | None) -> tuple[float, l
 
     code = document.header.get("$INSUNITS", 0)
     try:
-        stated = units.conversion_factor(code, units.M)
+        stated = units.conversion_factor(units.InsertUnits(code), units.InsertUnits.Meters)
         name = units.unit_name(code)
     except (TypeError, IndexError, ValueError, KeyError):
         stated, name = None, ""
@@ -225,7 +222,7 @@ def _polylines(entity: Any, tolerance: float) -> Iterator[np.ndarray]:
     if is_flat_polyline and entity.has_width:
         elevation = entity.dxf.elevation
         height = float(getattr(elevation, "z", elevation))
-        trace = TraceBuilder.from_polyline(entity, round(2.0 * math.pi / MAX_SEGMENT_TURN))
+        trace = TraceBuilder.from_polyline(entity, ARC_SEGMENTS)
         rings = _mitred(trace) if entity.is_closed else list(trace.polygons())
         for ring in rings:
             corners = entity.ocs().points_to_wcs([(x, y, height) for x, y in (*ring, ring[0])])
@@ -245,8 +242,8 @@ def _mitred(trace: Any) -> list[Any]:
 
     if len(trace) != 1 or not isinstance(trace[0], LinearTrace) or len(trace[0]) < 4:
         return list(trace.polygons())
-    around = LinearTrace()
-    stations = list(trace[0])  # the last is the first once more
+    around, straight = LinearTrace(), trace[0]
+    stations = [straight[k] for k in range(len(straight))]  # the last is the first once more
     for station in (*stations, *stations[1:3]):
         around.add_station(station.vertex, station.start_width, station.end_width)
     faces = list(around.faces())[1 : len(stations)]  # once around, from the second corner

@@ -51,5 +51,5 @@ def _notes(occupied: np.ndarray, free: np.ndarray, resolution: float) -> list[st
     parts, _ = ndimage.label(occupied, np.ones((3, 3)))
     small = int((np.bincount(parts.ravel())[1:] <= SPECK).sum())
     if small:
-        notes.append(f"{small} specks of {SPECK} cells or less are kept as obstacles")
+        notes.append(f"specks of {SPECK} cells or less are kept as obstacles ({small})")
     return notes

@@ -14,6 +14,7 @@ TOLERANCE = 0.75  # [cells] by which a corner of a cell is off the line fitted t
 MAX_SHIFT = 1.0  # [cells] by which a corner of a cell is off the polygon
 THIN = 2  # [cells] a wall that ends with a side as short keeps its corners
 MAX_BACK = 1.5  # [cells] by which a piece may turn back along its line
+MIN_SIDE = 1e-3  # [cells] shorter sides are left out
 MIN_SINE = 0.2  # of the angle between two lines that are extended to the corner where they meet
 
 
@@ -70,7 +71,8 @@ def straight_sides(ring: np.ndarray) -> np.ndarray:
     while True:
         polygon, wrong = _polygon(moments, breaks)
         if not wrong:
-            return polygon
+            length = np.hypot(*(np.roll(polygon, -1, axis=0) - polygon).T)
+            return polygon[length > MIN_SIDE]
         breaks = sorted({*breaks, *wrong})
 
 
@@ -161,7 +163,8 @@ def _split(moments: _Moments, breaks: list[int]) -> list[int]:
 def _furthest(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[int, float]:
     """Which of the points (n, 2) but the first and last is furthest from a side, and how far."""
     step, offset = end - start, points[1:-1] - start
-    share = np.clip(offset @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+    share = offset @ step / max(float(step @ step), 1e-12)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
     distance = np.hypot(*(offset - share[:, None] * step).T)
     furthest = int(distance.argmax())
     return 1 + furthest, float(distance[furthest])

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam.io import svg_tree
 from jaxslam.io.drawing import (
     CURVE_TOLERANCE,
     Drawing,
@@ -21,26 +22,25 @@ from jaxslam.io.drawing import (
     unit_missing,
 )
 from jaxslam.io.errors import InputError
+from jaxslam.io.svg_paths import polylines_of
+from jaxslam.io.svg_tree import ADVICE, LENGTH, SVG
 
-SVG = "{http://www.w3.org/2000/svg}"
 INKSCAPE = "{http://www.inkscape.org/namespaces/inkscape}"
 CLIP = re.compile(r"(clip-path|mask)'?\s*:\s*'?\s*url")  # in an attribute or a style
 PIXEL = 0.0254 / 96  # [m] of CSS
-PHYSICAL = re.compile(r"\s*[+]?[\d.]+(e[+-]?\d+)?\s*(mm|cm|in|pt|pc)\s*$", re.IGNORECASE)
-NOT_DRAWN = {f"{SVG}{tag}" for tag in ("symbol", "marker", "mask", "clipPath", "pattern")}
+PHYSICAL = {"mm", "cm", "in", "pt", "pc"}
+"""Units of length of a page that are no pixels."""
 LEFT_OUT = {f"{SVG}text": "texts", f"{SVG}image": "images", f"{SVG}foreignObject": "other objects"}
 WIDE = 0.02  # [m] of a stroke that may be a wall and not a pen
 PAGE = 0.99  # of its width and height: a filled rectangle as large is the paper
-MAX_BYTES = 2**26
-ADVICE = "save it as plain SVG"
 
 
 def read(path: Path, unit: str | float | None = None, layers: Sequence[str] = ()) -> Drawing:
     """Read the lines of a drawing: those of strokes in their middle, of filled shapes at the edge.
 
     The lower left corner of the page is the origin (of a page without a height the upper left one),
-    y is up. Transforms, `viewBox` and `use` are
-    applied; curves become segments within `CURVE_TOLERANCE`.
+    y is up. Transforms, `viewBox` and `use` are applied; curves become segments within
+    `CURVE_TOLERANCE`.
 
     Args:
         path: SVG file.
@@ -55,9 +55,9 @@ def read(path: Path, unit: str | float | None = None, layers: Sequence[str] = ()
         import svgelements
     except ImportError:
         raise no_library(path, "svgelements") from None
-    tree = _tree(path)
+    tree = svg_tree.read(path)
     left_out = Counter(LEFT_OUT[item.tag] for item in tree.iter() if item.tag in LEFT_OUT)
-    _hide_what_is_not_drawn(path, tree)
+    left_out += svg_tree.missing_uses(tree)
     try:
         source = io.StringIO(ET.tostring(tree, encoding="unicode"))
         root = svgelements.SVG.parse(source, parse_display_none=True, on_error="raise")
@@ -72,7 +72,7 @@ def read(path: Path, unit: str | float | None = None, layers: Sequence[str] = ()
     scale = _pixels_of_a_unit(path, tree, root)
     if unit is not None:
         size = size_of_unit(unit) / scale
-    elif PHYSICAL.match(tree.get("width", "")):
+    elif (length := LENGTH.match(tree.get("width", ""))) and length[2].lower() in PHYSICAL:
         size = PIXEL
     else:
         raise unit_missing(path, "is a drawing without a unit")
@@ -82,10 +82,14 @@ def read(path: Path, unit: str | float | None = None, layers: Sequence[str] = ()
         if is_hidden:
             left_out["hidden shapes"] += 1
             continue
+        try:
+            found = list(polylines_of(shape, CURVE_TOLERANCE / size))
+        except ValueError as error:
+            problem = f"has a shape that cannot be read ({error})"
+            raise InputError(problem, path=path, advice=ADVICE) from None
         if _is_paper(svgelements, shape, page):
             left_out["pages"] += 1
             continue
-        found = list(_polylines(svgelements, shape, CURVE_TOLERANCE / size))
         counted[layer or "no layer"] += sum(len(line) - 1 for line in found)
         if not layers or layer in layers:
             lines += found
@@ -103,63 +107,6 @@ def read(path: Path, unit: str | float | None = None, layers: Sequence[str] = ()
     bottom = page[1] if tree.get("viewBox") or tree.get("height") else 0.0
     walls = joined(lines) * [1.0, -1.0, 1.0, -1.0] + [0.0, bottom, 0.0, bottom]
     return Drawing(walls * size, left_out, tuple(filter(None, notes)))
-
-
-def _tree(path: Path) -> ET.Element:
-    """The XML tree of a file."""
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        raise InputError("does not exist", path=path, advice="check the name") from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"is larger than {MAX_BYTES >> 20} MiB", path=path, advice=ADVICE)
-    if data[:2] == b"\x1f\x8b":
-        raise InputError("is compressed", path=path, advice="unpack it: gunzip, and name it .svg")
-    try:
-        tree = ET.fromstring(data)
-    except ET.ParseError as error:
-        line = error.position[0]
-        problem = f"is no XML ({error.msg.partition(':')[0]})"
-        raise InputError(problem, path=path, line=line, advice=ADVICE) from None
-    except (ValueError, LookupError):  # of its encoding
-        raise InputError("is no XML", path=path, advice=ADVICE) from None
-    if tree.tag == "svg":  # without its namespace
-        for item in tree.iter():
-            if isinstance(item.tag, str) and not item.tag.startswith("{"):
-                item.tag = SVG + item.tag
-    if tree.tag != f"{SVG}svg":
-        problem = f"is XML of <{tree.tag.rpartition('}')[2]:.20}>, not of <svg>"
-        raise InputError(problem, path=path, advice=ADVICE)
-    return tree
-
-
-def _hide_what_is_not_drawn(path: Path, tree: ET.Element) -> None:
-    """Move elements that are drawn only where others refer to them into definitions.
-
-    Raises:
-        InputError: A symbol that is used has a `viewBox`, which svgelements does not apply.
-    """
-    used = {
-        value.removeprefix("#")
-        for item in tree.iter(f"{SVG}use")
-        for key, value in item.attrib.items()
-        if key.endswith("href")
-    }
-    for item in tree.iter(f"{SVG}symbol"):
-        if item.get("id") in used and item.get("viewBox"):
-            problem = f"uses the symbol {item.get('id')!r:.40}, which has a viewBox"
-            advice = "convert symbols to groups (Inkscape: Object, Symbols), or remove them"
-            raise InputError(problem, path=path, advice=advice)
-    for parent in list(tree.iter()):
-        if parent.tag == f"{SVG}defs":
-            continue
-        for k, item in enumerate(parent):
-            if item.tag in NOT_DRAWN:
-                parent[k] = ET.Element(f"{SVG}defs")
-                parent[k].append(item)
 
 
 def _pixels_of_a_unit(path: Path, tree: ET.Element, root: Any) -> float:
@@ -192,7 +139,7 @@ def _shapes(
     for item in group:
         own = item.values.get("attributes", {})
         hidden = is_hidden or str(item.values.get("display", "")).lower() == "none"
-        if isinstance(item, svgelements.Group):
+        if isinstance(item, (svgelements.Group, svgelements.Use)):
             inside = layer
             if own.get(f"{INKSCAPE}groupmode") == "layer":
                 inside = own.get(f"{INKSCAPE}label") or own.get("id") or layer
@@ -213,46 +160,3 @@ def _is_paper(svgelements: Any, shape: Any, page: np.ndarray) -> bool:
         return False
     box = shape.bbox()
     return box is not None and bool((np.subtract(box[2:], box[:2]) >= PAGE * page).all())
-
-
-def _polylines(svgelements: Any, shape: Any, tolerance: float) -> Iterator[np.ndarray]:
-    """Polylines (n, 2) [px] of a shape, within a tolerance [px] of its curves."""
-    points: list[tuple[float, float]] = []
-    for part in svgelements.Path(shape):
-        if isinstance(part, svgelements.Move):
-            if len(points) > 1:
-                yield np.array(points)
-            points = [(part.end.x, part.end.y)]
-            continue
-        if not points:
-            points = [(part.start.x, part.start.y)]
-        count = _pieces(svgelements, part, tolerance)
-        points += [(p.x, p.y) for p in (part.point(k / count) for k in range(1, count))]
-        points.append((part.end.x, part.end.y))
-    if len(points) > 1:
-        yield np.array(points)
-
-
-def _pieces(svgelements: Any, part: Any, tolerance: float) -> int:
-    """Number of segments for a part of a path.
-
-    References:
-        Wang, Shen, Zheng (1984): a Bezier curve of degree n with second differences of its control
-        points of M at most is within n (n - 1) M / (8 k^2) of k segments at equal parameters.
-    """
-    if isinstance(part, svgelements.Arc):
-        radius = max(part.rx, part.ry)
-        if not radius > tolerance:
-            return 4
-        step = 2.0 * math.acos(1.0 - tolerance / radius)
-        return max(1, math.ceil(abs(float(part.sweep)) / step))
-    if isinstance(part, svgelements.QuadraticBezier):
-        control = [part.start, part.control, part.end]
-    elif isinstance(part, svgelements.CubicBezier):
-        control = [part.start, part.control1, part.control2, part.end]
-    else:
-        return 1
-    bend = np.diff(np.array([(p.x, p.y) for p in control]), 2, axis=0)
-    degree = len(control) - 1
-    furthest = float(np.hypot(*bend.T).max())
-    return max(1, math.ceil(math.sqrt(degree * (degree - 1) * furthest / (8.0 * tolerance))))

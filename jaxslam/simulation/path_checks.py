@@ -42,30 +42,34 @@ def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
     """
     path, walls = as_float64("path", path, ("K", 2)), as_float64("walls", world.walls, ("S", 4))
     count = max(2, min(NUM_POINTS, int(np.ceil(float(polylines.length(path))))))
-    points = np.concatenate([path[:1], polylines.resample(path, count)[1:]])
+    points = polylines.resample(path, count)
     share = np.array([_open_share(walls, point) for point in points])
-    if (share >= OPEN).any():
-        first = int((share >= OPEN).argmax())
-        x, y = points[first]
-        place = "starts" if first == 0 else "leaves the building"
-        raise ValueError(
-            f"path {place} at x {x:.2f}, y {y:.2f} m, from where {share[first]:.0%} of the "
-            "directions meet no wall: it is outside"
-        )
+    if share[0] >= OPEN:
+        raise ValueError(f"path starts {_outside(points[0], share[0])}")
     clearance = np.inf
     block = max(1, _BLOCK // len(walls))
     for top in range(0, len(path) - 1, block):
         legs = np.hstack([path[:-1], path[1:]])[top : top + block]
         crosses, distance = _legs_and_walls(legs, walls)
         if crosses.any():
-            leg, wall = np.argwhere(crosses)[0]
-            x, y = _crossing(legs[leg], walls[wall])
+            first = int(crosses.any(axis=1).argmax())
+            x, y = _first_crossing(legs[first], walls[crosses[first]])
             raise ValueError(
                 f"path goes through a wall at x {x:.2f}, y {y:.2f} m, from waypoint "
-                f"{top + leg + 1} to {top + leg + 2}"
+                f"{top + first + 1} to {top + first + 2}"
             )
         clearance = min(clearance, float(distance.min()))
+    if (share >= OPEN).any():
+        first = int((share >= OPEN).argmax())
+        raise ValueError(f"path leaves the building {_outside(points[first], share[first])}")
     return PathCheck(clearance, float(share.mean()))
+
+
+def _outside(point: np.ndarray, share: float) -> str:
+    """Where a point (2,) is, and why it is outside."""
+    x, y = point
+    place = f"at x {x:.2f}, y {y:.2f} m, which is outside"
+    return f"{place}: {share:.0%} of all directions meet no wall"
 
 
 def _open_share(walls: np.ndarray, point: np.ndarray) -> float:
@@ -103,9 +107,10 @@ def _distance(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarr
     return np.asarray(np.hypot(*np.moveaxis(point - near, -1, 0)))
 
 
-def _crossing(leg: np.ndarray, wall: np.ndarray) -> np.ndarray:
-    """Point (2,) where a leg (4,) and a wall (4,) meet; the leg's start where they are parallel."""
-    along, across = leg[2:] - leg[:2], wall[2:] - wall[:2]
-    slope = float(_cross(along, across))
-    share = float(_cross(wall[:2] - leg[:2], across)) / slope if slope else 0.0
-    return np.asarray(leg[:2] + min(max(share, 0.0), 1.0) * along)
+def _first_crossing(leg: np.ndarray, walls: np.ndarray) -> np.ndarray:
+    """Point (2,) nearest to the start of a leg (4,) where it meets walls (S, 4), which it does."""
+    along, across = leg[2:] - leg[:2], walls[:, 2:] - walls[:, :2]
+    slope = _cross(along[None], across)
+    safe = np.where(slope != 0.0, slope, 1.0)
+    share = np.where(slope != 0.0, _cross(walls[:, :2] - leg[:2], across) / safe, 0.0)
+    return np.asarray(leg[:2] + np.clip(share.min(), 0.0, 1.0) * along)

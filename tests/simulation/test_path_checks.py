@@ -1,0 +1,74 @@
+"""Paths through walls, or out of the building, are refused; others are measured."""
+
+import numpy as np
+import pytest
+
+from jaxslam.simulation import worlds
+from jaxslam.simulation.path_checks import check_path_in_world
+from jaxslam.simulation.worlds import World, named, outline, polyline
+
+ROOM = World(outline([(0.0, 0.0, 6.0, 4.0)], [(3.0, 0.0, 3.2, 3.0)]))  # a wall from y 0 to 3
+
+
+def test_the_drive_of_the_office_is_accepted():
+    found = check_path_in_world(worlds.waypoints("office"), named("office"))
+    assert found.open_share == 0.0  # it is closed
+    assert 0.3 < found.clearance < 1.0
+
+
+def test_clearance_is_the_distance_of_the_nearest_wall():
+    assert check_path_in_world([[1, 1], [1, 2.5]], ROOM).clearance == pytest.approx(1.0)
+    assert check_path_in_world([[1, 3.5], [5, 3.6]], ROOM).clearance == pytest.approx(0.4)  # above
+
+
+@pytest.mark.parametrize(
+    "path, message",
+    [
+        ([[1, 1], [5, 1]], "goes through a wall at x 3.00, y 1.00 m, from waypoint 1 to 2"),
+        ([[1, 1], [1, 2], [1, 3.5], [4, 2]], "wall at x 3.00, y 2.50 m, from waypoint 3 to 4"),
+        ([[1, 1], [3, 2]], "goes through a wall at x 3.00, y 2.00 m"),  # ends in it
+        ([[1, 1], [3, 3], [5, 3.5]], "goes through a wall at x 3.00, y 3.00 m"),  # at its corner
+        ([[1, 3], [1, 4], [2, 4]], "goes through a wall at x 1.00, y 4.00 m"),  # along it
+        ([[1, 1], [1, 9]], "goes through a wall at x 1.00, y 4.00 m"),
+        ([[-1, 2], [1, 2]], r"starts at x -1.00, y 2.00 m, which is outside: \d+% of all direct"),
+    ],
+)
+def test_paths_that_cannot_be_driven_are_refused(path, message):
+    with pytest.raises(ValueError, match=message):
+        check_path_in_world(np.array(path, float), ROOM)
+
+
+def test_a_path_may_look_out_of_an_open_building_but_not_leave_it():
+    walls = polyline([(6, 2.5), (6, 4), (0, 4), (0, 0), (6, 0), (6, 1.5)])  # a door, 1 m wide
+    inside = np.array([[1.0, 1.0], [4.0, 2.0]])
+    share = check_path_in_world(inside, World(walls)).open_share
+    angles = [2 * np.arctan2(0.5, 5.0) / (2 * np.pi), 2 * np.arctan2(0.5, 2.0) / (2 * np.pi)]
+    assert angles[0] < share < angles[1]
+    with pytest.raises(
+        ValueError, match=r"leaves the building at x 6.8\d, y 2.00 m, which is outside"
+    ):
+        check_path_in_world([[1.0, 2.0], [8.0, 2.0]], World(walls))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_crossings_are_those_of_shapely(seed):
+    shapely = pytest.importorskip("shapely", reason="pip install 'jaxslam[test]'")
+    rng = np.random.default_rng(seed)
+    box = outline([(0.0, 0.0, 10.0, 10.0)])
+    starts = rng.uniform(1, 9, (6, 2))
+    inner = np.hstack([starts, np.clip(starts + rng.normal(size=(6, 2)), 0.5, 9.5)])
+    world = World(np.vstack([box, inner]))
+    lines = shapely.MultiLineString([wall.reshape(2, 2) for wall in world.walls])
+    for _ in range(20):
+        path = rng.uniform(0.2, 9.8, (4, 2))
+        distance = shapely.distance(shapely.LineString(path), lines)
+        if distance == 0.0:
+            with pytest.raises(ValueError, match="goes through a wall"):
+                check_path_in_world(path, world)
+        else:
+            assert check_path_in_world(path, world).clearance == pytest.approx(distance)
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="path"):
+        check_path_in_world([1.0, 2.0], ROOM)

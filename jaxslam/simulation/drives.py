@@ -94,7 +94,7 @@ def drive(
     slips, carried = None, None
     if events is not None:
         slips = events.faults.slip
-        carried = jnp.arange(num_scans - 1) == events.faults.carried_at
+        carried = jnp.arange(num_scans - 1, dtype=jnp.int32) == events.faults.carried_at
     steps = draws, slips, carried
     _, (poses, odometry, between) = lax.scan(body, (first, jnp.int32(0)), steps)
     poses = jnp.concatenate([first[None], poses])

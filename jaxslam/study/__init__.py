@@ -1,1 +1,8 @@
 """Studies: variants of a robot, its building and its filter, compared over many trials."""
+
+from jaxslam.study.outcomes import Outcomes as Outcomes
+from jaxslam.study.outcomes import compare as compare
+from jaxslam.study.outcomes import failures_by_place as failures_by_place
+from jaxslam.study.outcomes import summarise as summarise
+from jaxslam.study.runner import Variant as Variant
+from jaxslam.study.runner import run as run

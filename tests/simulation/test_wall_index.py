@@ -144,6 +144,7 @@ def rooms_of(seed):
     return jnp.asarray(walls), of_one_shape(index_walls(walls, 12.0)), jnp.array([14.2, 15.1, 0.3])
 
 
+@pytest.mark.slow
 def test_scans_by_an_index_are_batched_and_differentiable():
     walls, index, pose = rooms_of(0)
     poses = pose[None] + jnp.arange(3.0)[:, None]

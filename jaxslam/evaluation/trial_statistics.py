@@ -25,13 +25,13 @@ class Difference(NamedTuple):
         mean: Of the second less the first.
         standard_error: Of `mean`, of trials that are paired.
         unpaired_standard_error: The same if the trials of the two had nothing in common.
-        count: Number of pairs in which both are finite.
+        pairs: Number of trials in which both are finite.
     """
 
     mean: float
     standard_error: float
     unpaired_standard_error: float
-    count: int
+    pairs: int
 
 
 def proportion(successes: int, trials: int, confidence: float = CONFIDENCE) -> Interval:

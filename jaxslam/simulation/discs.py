@@ -72,7 +72,9 @@ def nearest_discs(lidar: Lidar, pose: Array, discs: Discs) -> tuple[Array, Array
     """
     beam = unit_vector(pose[2] + beam_angles(lidar))
     x, y = discs.centre[:, 0] - pose[0], discs.centre[:, 1] - pose[1]
-    return search(_distance, (beam[:, 0], beam[:, 1]), _Seen(x, y, discs.radius))
+    return search(
+        _distance, (beam[:, 0], beam[:, 1]), _Seen(*map(jnp.asarray, (x, y, discs.radius)))
+    )
 
 
 @nearest_discs.defjvp

@@ -4,6 +4,7 @@ What may go wrong is a record of numbers, `Life`, and of what may move, `Movers`
 one drive is drawn once, at its start (`Events`); so a scan depends on its time and place alone.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -238,7 +239,7 @@ def scan_life(
         is_wall = (seen[2] >= 0) & (seen[2] < len(walls))
         is_glass = is_wall & events.glass[jnp.clip(seen[2], 0, len(walls) - 1)]
         passes = is_glass & (seen[1] > life.ranges.glass_angle)
-        return tuple(jnp.where(passes, b, a) for a, b in zip(seen, behind, strict=True))
+        return jax.tree.map(partial(jnp.where, passes), behind, seen)
 
     seen = look(world)
     distance, angle, surface = jax.lax.cond(

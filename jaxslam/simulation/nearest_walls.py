@@ -130,7 +130,7 @@ def _by_index(lidar: Lidar, pose: Array, walls: Array, index: WallIndex) -> tupl
         lines = lax.optimization_barrier(_lines(pose, walls[wall]))  # gather once, not per beam
         each = [jax.tree.map(itemgetter((k, None)), lines) for k in range(len(wall))]
         distances = [_distance(x_y, line) for line in each]
-        best = nearest_of(best, distances, wall[:, None])
+        best = nearest_of(best, distances, list(wall[:, None]))
         open_ = jnp.minimum(jnp.max(best[0], axis=0), lidar.range_max) > index.horizon[row]
         return best, jnp.where(open_, index.following[row], row), open_
 

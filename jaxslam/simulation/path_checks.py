@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxslam.core import polylines
 from jaxslam.core.types import as_float64
-from jaxslam.simulation.ray_casting import SEAM
+from jaxslam.simulation.nearest_walls import SEAM
 from jaxslam.simulation.worlds import World
 
 OPEN = 0.5  # of the directions around a point that meet no wall: it is outside

@@ -56,7 +56,7 @@ def find_hits(lidar: Lidar, world: World, pose: Array, discs: Discs | None = Non
     """
     check_array("world.walls", world.walls, ("S", 4), jnp.floating)
     check_array("pose", pose, (3,), jnp.floating)
-    distance, wall = nearest_walls(lidar, pose, jnp.asarray(world.walls), world.index)
+    distance, wall = nearest_walls(lidar, pose, jnp.asarray(world.walls), world.wall_index)
     disc = jnp.full_like(wall, -1)
     if discs is not None and len(discs.radius):
         nearer, number = nearest_discs(lidar, pose, as_discs(discs))
@@ -121,7 +121,7 @@ def share_leaving(lidar: Lidar, world: World, poses: Array) -> Leaving:
     """
     endless = lidar._replace(range_max=jnp.inf)
     walls = jnp.asarray(world.walls)
-    distance = lax.map(lambda pose: nearest_walls(endless, pose, walls, world.index)[0], poses)
+    distance = lax.map(lambda pose: nearest_walls(endless, pose, walls, world.wall_index)[0], poses)
     return Leaving(
         beyond_range=jnp.mean(distance >= lidar.range_max, dtype=poses.dtype),
         no_wall=jnp.mean(jnp.isinf(distance), dtype=poses.dtype),

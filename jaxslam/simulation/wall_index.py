@@ -83,7 +83,7 @@ def index_walls(walls: AnyArray, range_max: float) -> WallIndex:
 
     number = np.arange(shape.prod())
     centres = low + (np.stack(np.divmod(number, shape[1]), axis=1) + 0.5) * side
-    parts = [_list_of_all(len(walls), reach)]
+    parts: list[tuple[np.ndarray, ...]] = [_list_of_all(len(walls), reach)]
     first, count = [], len(parts[0][0])
     empty = count - 1
     for own in np.array_split(centres, -(-len(centres) * len(walls) // PAIRS)):

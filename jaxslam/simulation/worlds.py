@@ -26,11 +26,11 @@ class World(NamedTuple):
 
     Attributes:
         walls: (S, 4) [m] ends x1, y1, x2, y2, world frame.
-        index: Of the walls, for fast ray casting among many; None to try all of them.
+        wall_index: Of the walls, for fast ray casting among many; None to try all of them.
     """
 
     walls: AnyArray
-    index: WallIndex | None = None
+    wall_index: WallIndex | None = None
 
 
 def with_index(world: World, range_max: float) -> World:

@@ -37,7 +37,7 @@ def test_pairs_leave_out_what_both_have_in_common():
     first, second = common + 0.1 * rng.normal(size=400), common + 0.3 + 0.1 * rng.normal(size=400)
     second[5] = np.nan
     found = paired_difference(first, second)
-    assert found.count == 399 and abs(found.mean - 0.3) < 4.5 * found.standard_error
+    assert found.pairs == 399 and abs(found.mean - 0.3) < 4.5 * found.standard_error
     np.testing.assert_allclose(found.standard_error, 0.1 * np.sqrt(2 / 399), rtol=0.15)
     np.testing.assert_allclose(found.unpaired_standard_error, np.sqrt(2.02 / 399), rtol=0.15)
     assert np.isnan(paired_difference([1.0], [2.0]).mean)

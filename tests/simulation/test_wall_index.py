@@ -204,8 +204,8 @@ def test_other_scanners_are_cast_by_the_same_index():
 
 def test_only_many_walls_are_indexed():
     walls = jnp.asarray(padded(np.zeros((0, 4))))
-    assert with_index(World(walls[:UNINDEXED]), 10.0).index is None
-    assert with_index(World(walls[: UNINDEXED + 1]), 10.0).index is not None
+    assert with_index(World(walls[:UNINDEXED]), 10.0).wall_index is None
+    assert with_index(World(walls[: UNINDEXED + 1]), 10.0).wall_index is not None
 
 
 def test_the_share_of_beams_that_leave_an_open_world():

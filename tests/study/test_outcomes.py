@@ -87,7 +87,7 @@ def test_a_variant_of_which_all_trials_fail_has_numbers():
     assert numbers["success"]["value"] == 0.0 and numbers["nonfinite"] == N
     assert numbers["position_rmse_m"]["p50"]["value"] is None
     found = compare(broken, broken, success_distance=1.0)
-    assert found["success"]["mean"] == 0.0 and found["log_position_rmse"]["count"] == 0
+    assert found["success"]["mean"] == 0.0 and found["log_position_rmse"]["pairs"] == 0
 
 
 @pytest.mark.parametrize("distance", [0.05, 5.0])

@@ -139,19 +139,19 @@ def _plain(name: str, value: Any) -> Any:
     return tuple(numbers.tolist()) if shape else float(numbers)
 
 
-def as_world(world: Any, range_max: float) -> World:
+def as_world(world: Any, range_max: float | None = None) -> World:
     """A world in JAX's precision, of its name or of walls; many walls with an index.
 
     Args:
         world: Its name, or its walls. An index that they have is made anew.
-        range_max: [m] of the scanner that will be there.
+        range_max: [m] of the scanner that will be there; None to make no index.
 
     Raises:
         ValueError: There is no world of this name, or the walls are not (S, 4) finite numbers.
     """
     if isinstance(world, str):
         walls = jnp.asarray(named_worlds.named_world(world).walls, float)
-        return with_index(World(walls), range_max)
+        return World(walls) if range_max is None else with_index(World(walls), range_max)
     if not isinstance(world, World):
         raise ValueError(
             f"world is {type(world).__name__}, not World or one of the names "
@@ -160,7 +160,7 @@ def as_world(world: Any, range_max: float) -> World:
     walls = as_float("world.walls", world.walls, ("S", 4))
     if not np.isfinite(walls).all():
         raise ValueError("world.walls holds numbers that are not finite")
-    return with_index(World(walls), range_max)
+    return World(walls) if range_max is None else with_index(World(walls), range_max)
 
 
 def as_path(path: Any, world: Any) -> Array:

@@ -156,8 +156,8 @@ def simulated(monkeypatch):
     """Calls of the simulation, which is left out."""
     calls = []
 
-    def simulate(keys, config, robot, world, path, *, num_scans, noise_by_incidence):
-        assert noise_by_incidence == 0.0
+    def simulate(keys, config, robot, world, path, *, num_scans, noise_by_incidence, life):
+        assert noise_by_incidence == 0.0 and life is None
         calls.append((keys.shape, robot, world.walls, path, num_scans))
 
     monkeypatch.setattr(trials, "simulate_keys", simulate)

@@ -182,7 +182,7 @@ def test_single_precision_finds_the_same():
     rng = np.random.default_rng(3)
     walls = padded(WORLDS["any lengths"](rng))
     poses = np.hstack([rng.uniform(0, 25, (200, 2)), rng.uniform(-3, 3, (200, 1))])
-    index = with_index(World(jnp.asarray(walls, float)), ROUND.range_max).index
+    index = with_index(World(jnp.asarray(walls, float)), ROUND.range_max).wall_index
     assert index.horizon.dtype == jnp.float32
     (by_index, wall), (by_all, same) = both(
         ROUND, jnp.asarray(walls, float), index, jnp.asarray(poses, float)

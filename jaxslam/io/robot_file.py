@@ -32,19 +32,15 @@ alone in the SI unit. `*` marks what must be there. An unknown key is an error. 
     [body]            radius of a circle around the origin, or length and width around it
 """
 
-import json
 import math
-import re
-import tomllib
 from os import PathLike
 from typing import Any, NamedTuple
 
-from jaxslam.io import strict_json
+from jaxslam.io import toml_or_json
 from jaxslam.io.errors import InputError
 from jaxslam.io.quantities import Table
 from jaxslam.io.robot_drive import read_drive, read_limits
 from jaxslam.io.robot_scanner import read_scanner
-from jaxslam.io.text import lines
 from jaxslam.simulation.arguments import as_robot
 from jaxslam.simulation.kinematics import turning_radius
 from jaxslam.simulation.robot import Robot
@@ -145,7 +141,7 @@ def read(path: str | PathLike) -> RobotFile:
         InputError: The file cannot be read, or is neither; a key is unknown, missing or of another
             drive; a value is not possible, has an unknown unit, or contradicts another one.
     """
-    content = _content(path)
+    content = toml_or_json.read(path, ADVICE)
     for key in content:
         if key not in ("name", *SECTIONS):
             known = ", ".join(("name", *SECTIONS))
@@ -190,37 +186,6 @@ def _name(path: str | PathLike, content: dict[str, Any]) -> str:
         problem = f"{name!r} is no text of one line"[:200]
         raise InputError(problem, path=path, field="name", advice="write it in quotes")
     return name.strip()
-
-
-def _content(path: str | PathLike) -> dict[str, Any]:
-    """Tree of a file, JSON by its name or its first character, TOML otherwise."""
-    data = b"".join(line for _, line in lines(path))
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError:
-        raise InputError("is not UTF-8", path=path, advice="save it as UTF-8") from None
-    if str(path).lower().endswith(".json") or text.lstrip().startswith("{"):
-        try:
-            found = strict_json.parse(text)
-        except json.JSONDecodeError as error:
-            problem = f"is not JSON ({error.msg})"
-            raise InputError(problem, path=path, line=error.lineno, advice=ADVICE) from None
-        except ValueError as error:
-            raise InputError(f"is not JSON ({error})", path=path, advice=ADVICE) from None
-        except RecursionError:
-            raise InputError("is nested too deep", path=path, advice=ADVICE) from None
-        if not isinstance(found, dict):
-            raise InputError("is no JSON object", path=path, advice=ADVICE)
-        return found
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        place = re.search(r" \(at line (\d+), column \d+\)$", str(error))
-        problem = f"is not TOML ({str(error)[: place.start()] if place else error})"
-        line = int(place[1]) if place else None
-        raise InputError(problem, path=path, line=line, advice=ADVICE) from None
-    except RecursionError:
-        raise InputError("is nested too deep", path=path, advice=ADVICE) from None
 
 
 def _mount(table: Table) -> tuple[float, float, float]:

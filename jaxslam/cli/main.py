@@ -1,4 +1,4 @@
-"""The command line: `jaxslam simulate`, `run`, `localise`, `map`, `route` and `tune`."""
+"""The command line: `jaxslam simulate`, `run`, `localise`, `map`, `route`, `tune` and `study`."""
 
 import contextlib
 import functools
@@ -26,6 +26,7 @@ COMMANDS = {
     "map": "map_command.map_occupancy",
     "route": "route_command.plan_route",
     "tune": "tune_command.tune",
+    "study": "study_command.study",
 }
 """Module and function of each command."""
 

@@ -48,7 +48,7 @@ from jaxslam.simulation.wheel_faults import WheelFaults
 
 MAX_VARIANTS = 1000
 MAX_TRIALS = 10**6
-PARTS = {"ranges": RangeErrors, "traffic": Traffic, "wheels": WheelFaults}
+PARTS: dict[str, Any] = {"ranges": RangeErrors, "traffic": Traffic, "wheels": WheelFaults}
 """The parts of `Life`; their fields are the settings `life.FIELD`."""
 
 TEXTS = {

@@ -34,7 +34,10 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     "arguments, line",
     [
-        ("fly", "fly: is no command; the commands are simulate, run, localise, map, route, tune"),
+        (
+            "fly",
+            "fly: is no command; the commands are simulate, run, localise, map, route, tune, study",
+        ),
         ("rout out", "rout: is no command; did you mean route?"),
         ("--fly", "--fly: is no command; the commands are"),
         ("map a.png --resolution abc", "--resolution: 'abc' is no number; write --resolution M"),

@@ -1,0 +1,133 @@
+"""The page of a study: success, errors and times of its variants, and where trials fail."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxslam.core.types import AnyArray, Metrics
+from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY
+
+COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, BLACK, GREY)
+MAX_SHOWN = 40  # variants with a line of their own
+MAX_LETTERS = 34  # of a name
+
+
+class StudyPage(NamedTuple):
+    """What a page shows.
+
+    Attributes:
+        names: (V,) of the variants.
+        summaries: (V,) as `study.summarise` makes them.
+        walls: (S, 4) [m] of the building of the variant that is mapped.
+        mapped: Its number.
+        places: Where its trials fail, as of `study.failures_by_place`.
+        seconds: [s] that a trial of it lasts.
+    """
+
+    names: Sequence[str]
+    summaries: Sequence[Metrics]
+    walls: AnyArray
+    mapped: int
+    places: Metrics
+    seconds: float
+
+
+def study_page(page: StudyPage) -> Figure:
+    """Draw the page of a study; of more than `MAX_SHOWN` variants the first ones."""
+    shown = min(len(page.names), MAX_SHOWN)
+    rows = 1.6 + 0.24 * shown
+    figure = Figure(figsize=(11, rows + 5.6), dpi=100, layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=[rows, 5.0])
+    success, errors = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    names = [_short(name) for name in page.names[:shown]]
+    summaries = page.summaries[:shown]
+    _draw_success(success, names, summaries)
+    _draw_quantiles(errors, summaries)
+    _draw_survival(figure.add_subplot(grid[1, 0]), names, summaries, page.seconds)
+    _draw_places(figure.add_subplot(grid[1, 1]), page)
+    if shown < len(page.names):
+        figure.suptitle(f"the first {shown} of {len(page.names)} variants", fontsize=9)
+    return figure
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= MAX_LETTERS else name[: MAX_LETTERS - 1] + "\N{HORIZONTAL ELLIPSIS}"
+
+
+def _draw_success(axis: Axes, names: Sequence[str], summaries: Sequence[Metrics]) -> None:
+    """Shares of trials that succeed, with their intervals."""
+    rows = np.arange(len(names))
+    found = [one["success"] for one in summaries]
+    value, low, high = (
+        np.array([one[key] for one in found], float) for key in ("value", "low", "high")
+    )
+    spread = np.maximum([value - low, high - value], 0.0)
+    axis.errorbar(value, rows, xerr=spread, fmt="o", color=BLUE, ecolor=GREY, capsize=2)
+    axis.set(xlim=(-0.03, 1.03), xlabel="trials that succeed, with 95 % intervals")
+    axis.set_yticks(rows, names, fontsize=8)
+    axis.invert_yaxis()
+    axis.grid(axis="x", alpha=0.3)
+
+
+def _draw_quantiles(axis: Axes, summaries: Sequence[Metrics]) -> None:
+    """Median and upper quantiles of the position RMSE of trials."""
+    rows = np.arange(len(summaries))
+    for key, colour, marker in (("p50", BLUE, "o"), ("p90", ORANGE, "s"), ("p99", RED, "^")):
+        found = [one["position_rmse_m"][key] for one in summaries]
+        value, low, high = (_numbers(found, k) for k in ("value", "low", "high"))
+        axis.plot(value, rows, marker, color=colour, label=key, markersize=4.5)
+        axis.hlines(rows, low, high, color=colour, alpha=0.4)
+    axis.set(xlabel="position RMSE of a trial [m]: quantiles, with 95 % intervals")
+    axis.set_yticks(rows, [])
+    axis.invert_yaxis()
+    if any(one["position_rmse_m"]["p50"]["value"] for one in summaries):
+        axis.set_xscale("log")
+    axis.grid(axis="x", alpha=0.3)
+    axis.legend(fontsize=8)
+
+
+def _numbers(found: Sequence[Any], key: str) -> np.ndarray:
+    return np.array([np.nan if one[key] is None else one[key] for one in found], float)
+
+
+def _draw_survival(
+    axis: Axes, names: Sequence[str], summaries: Sequence[Metrics], seconds: float
+) -> None:
+    """Share of trials that have not failed by a time."""
+    for number, (name, one) in enumerate(zip(names, summaries, strict=True)):
+        found = one["time_to_failure_s"]
+        times = np.concatenate([[0.0], found["times"], [seconds]])
+        share = np.concatenate([[1.0], found["share_without_failure"]])
+        share = np.append(share, share[-1])
+        colour = COLOURS[number % len(COLOURS)]
+        label = name if len(names) <= len(COLOURS) else None
+        axis.step(times, share, where="post", color=colour, label=label, linewidth=1.2)
+    axis.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="trials that have not failed yet")
+    axis.grid(alpha=0.3)
+    if len(names) <= len(COLOURS):
+        axis.legend(fontsize=7, loc="lower left")
+
+
+def _draw_places(axis: Axes, page: StudyPage) -> None:
+    """Errors by place, and where trials fail, of one variant."""
+    places = page.places
+    rmse = np.array([[np.nan if x is None else x for x in row] for row in places["rmse_m"]], float)
+    failures = np.array(places["failures"])
+    x, y = places["origin_m"]
+    side = places["cell_m"]
+    extent = (x, x + side * rmse.shape[0], y, y + side * rmse.shape[1])
+    image = axis.imshow(rmse.T, origin="lower", extent=extent, cmap="viridis", vmin=0.0)
+    axis.figure.colorbar(image, ax=axis, label="position RMSE there [m]", shrink=0.8)
+    lines = np.reshape(np.asarray(page.walls, float), (-1, 2, 2))
+    for (x0, y0), (x1, y1) in lines:
+        axis.plot([x0, x1], [y0, y1], color=GREY, linewidth=0.7)
+    i, j = np.nonzero(failures)
+    if len(i):
+        centre = x + side * (i + 0.5), y + side * (j + 0.5)
+        axis.scatter(*centre, s=12 + 12 * failures[i, j], color=RED, label="trials fail here")
+        axis.legend(fontsize=8)
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axis.set_title(_short(page.names[page.mapped]), fontsize=9)

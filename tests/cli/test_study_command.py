@@ -1,0 +1,120 @@
+"""The command `jaxslam study`: wrong studies are one line, a small one runs to its end."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxslam.cli import main, study_variants
+from jaxslam.study import runner, study_file
+
+SMALL = """
+trials = 5
+seed = 2
+success_m = 0.5
+[base]
+path = "p.csv"
+max_landmarks = 32
+[[variant]]
+name = "as it is"
+[[variant]]
+name = "people"
+life.people = 4
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "p.csv").write_text("1.0,0.9\n2.2,0.9\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def said_of(folder, text, capsys, *more):
+    (folder / "s.toml").write_text(text)
+    assert main.main(["study", str(folder / "s.toml"), "--out", str(folder / "o"), *more]) == 2
+    errors = capsys.readouterr().err
+    assert errors.startswith("jaxslam: error: ") and errors.count("\n") == 1
+    assert not (folder / "o").exists()
+    return errors
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        ('world = "ofice"\n', "s.toml: base: --world: no world named 'ofice'"),
+        ('world = "a.yaml"\n', "a.yaml"),
+        ('path = "none.csv"\n', "none.csv"),
+        ('scanner = "LDS-9"\n', "s.toml: base: no scanner named 'LDS-9'; there are: LDS-01"),
+        ('robot = "r.toml"\n', "r.toml"),
+        ('path = "p.csv"\nlife.closed = 0.2\n', "life.closed needs doors, and those of office are"),
+        ('path = "p.csv"\nlife.moved_at = 9\n', "life.moved_at needs furniture"),
+        ('path = "p.csv"\nodometry_factor = 0\n', "odometry_factor and sensor_factor are above 0"),
+        ('path = "p.csv"\ndrive = "route"\n', "--drive: is not for a drive that --path gives"),
+        ('path = "p.csv"\nscan_period = 0\n', "robot.scan_period is 0.0, not above 0"),
+        ("life.persons = 2\n", "base: life.persons is not known; did you mean life."),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(folder, base, message, capsys):
+    assert message in said_of(folder, f"[base]\n{base}", capsys)
+
+
+def test_a_path_through_a_wall_is_refused(folder, capsys):
+    (folder / "w.csv").write_text("1.0,0.9\n11.0,8.0\n")
+    assert "w.csv" in said_of(folder, '[base]\npath = "w.csv"\n', capsys)
+
+
+def test_variants_have_the_settings_of_the_study(folder):
+    (folder / "s.toml").write_text(
+        '[base]\npath = "p.csv"\n[vary]\nscanner = ["LDS-01", "TiM571"]\n'
+        "life.people = [0, 7]\nodometry_factor = [1, 2]\n"
+    )
+    found = study_variants.prepare(study_file.read(folder / "s.toml"))
+    assert len(found.variants) == 8 and any("LDS-01" in note for note in found.notes)
+    first, last = found.variants[0], found.variants[-1]
+    assert first.robot.scanner.name == "LDS-01" and last.robot.scanner.name == "TiM571"
+    assert first.config.frontend.lidar.num_beams == first.robot.scanner.num_beams
+    assert len(first.life.movers.people) == len(last.life.movers.people) == 7
+    assert float(first.life.traffic.people) == 0.0 and float(last.life.traffic.people) == 7.0
+    own = {one.settings["odometry_factor"]: one.params for one in found.variants[:2]}
+    for a, b in ((own[1.0], own[2.0]),):
+        np.testing.assert_allclose(2 * a.odometry_coefficients, b.odometry_coefficients)
+        np.testing.assert_array_equal(a.range_std, b.range_std)
+    plain = '[base]\npath = "p.csv"\n'
+    (folder / "s.toml").write_text(plain)
+    assert study_variants.prepare(study_file.read(folder / "s.toml")).variants[0].life is None
+
+
+def test_doors_of_a_random_building_are_in_its_openings():
+    doors = study_variants.doors_of("random:3")
+    length = np.hypot(*(doors[:, 2:] - doors[:, :2]).T)
+    assert len(doors) > 3 and length.min() > 0.7 and length.max() < 1.3
+
+
+@pytest.mark.slow
+def test_a_study_runs_resumes_and_writes_its_table(folder, capsys, monkeypatch):
+    (folder / "s.toml").write_text(SMALL)
+    call = ["study", "s.toml", "--out", "o"]
+    assert main.main([*call, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "2 variants of 5 trials" in said and "minutes on" in said
+    assert not (folder / "o").exists()
+    whole = runner._run_variant
+
+    def stops(number, *more):
+        if number == 1:
+            raise KeyboardInterrupt("interrupted; the same command resumes")
+        return whole(number, *more)
+
+    monkeypatch.setattr(runner, "_run_variant", stops)
+    assert main.main(call) == 130
+    assert list((folder / "o").glob("study_parts/000/*.npz"))
+    monkeypatch.setattr(runner, "_run_variant", whole)
+    assert main.main(call) == 0
+    assert sorted(x.name for x in (folder / "o").iterdir()) == ["study.json", "study.png"]
+    found = json.loads((folder / "o" / "study.json").read_text())
+    assert [row["name"] for row in found["variants"]] == ["as it is", "people"]
+    assert found["variants"][1]["settings"] == {"life.people": 4}
+    assert all(row["success"]["value"] == 1.0 for row in found["variants"])
+    assert found["variants"][1]["against_first"]["success"]["pairs"] == 5
+    assert "as it is" in capsys.readouterr().out

@@ -80,7 +80,7 @@ def test_a_path_is_in_the_coordinates_of_the_file(tmp_path):
 @pytest.mark.parametrize(
     "path, message",
     [
-        (None, "plan.csv: is a file, which has no drive of its own; add --drive patrol, or --path FILE"),
+        (None, "plan.csv: is a file, which has no drive of its own; add --drive patrol, or --path"),
         ([(1, 1), (5, 1)], "path.csv: path goes through a wall at x 3.00, y 1.00 m"),
         ([(9, 1), (9, 3)], "path.csv: path starts at x 9.00, y 1.00 m, which is outside"),
         ([(1, 1)], "path.csv: is a path shorter than 0.5 m"),

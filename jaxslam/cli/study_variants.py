@@ -1,6 +1,5 @@
 """Variants of a study, made of its settings."""
 
-from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,15 +52,11 @@ def prepare(study: StudyFile) -> Prepared:
     found = []
     slots = max(int(np.ceil(own.get("life.people", 0))) for _, own in study.variants)
     for name, settings in study.variants:
-        with _named(study.path, name):
+        with name_errors(f"{study.path}: {name}"):
             own = {key: settings[key] for key in study.varied if key in settings}
             given = files_of(settings, study.path.parent)
             found.append(_variant(name, own, given, slots, notes))
     return Prepared(tuple(found), tuple(notes))
-
-
-def _named(path: Path, name: str) -> AbstractContextManager[None]:
-    return name_errors(f"{path}: {name}")
 
 
 def _variant(

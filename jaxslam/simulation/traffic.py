@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core import polylines
 from jaxslam.core.types import AnyArray, Array, Key, as_float64
 
 WALKWAY_SPACING = 0.25  # [m] between points of a walkway
@@ -89,11 +90,10 @@ def walkway(path: Any) -> np.ndarray:
         ValueError: The path has another shape, or no length.
     """
     points = as_float64("path", path, ("K", 2))
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    if not along[-1] > 0.0:
+    length = float(polylines.length(points))
+    if not length > 0.0:
         raise ValueError("path has no length; people walk along it")
-    wanted = np.linspace(0.0, along[-1], max(2, round(along[-1] / WALKWAY_SPACING) + 1))
-    return np.stack([np.interp(wanted, along, x) for x in points.T], axis=1)
+    return polylines.resample(points, max(2, round(length / WALKWAY_SPACING) + 1))
 
 
 def make_crowd(key: Key, traffic: Traffic, movers: Movers) -> Crowd:

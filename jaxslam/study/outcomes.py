@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxslam.core import se2_np
 from jaxslam.core.types import Metrics
 from jaxslam.evaluation.consistency import CERTAIN_TRACE
 from jaxslam.evaluation.trial_statistics import (
@@ -45,7 +46,7 @@ def outcomes_of(result: TrialResult) -> Outcomes:
     """Outcomes of some trials, whose scans are all there and whose truth is known."""
     truth, estimate, cov = (np.asarray(x) for x in (result.truth, result.estimate, result.cov))
     gap = (estimate - truth).astype(np.float64)
-    turn = np.mod(gap[..., 2] + np.pi, 2 * np.pi) - np.pi
+    turn = se2_np.wrap_angle(gap[..., 2])
     error = np.hypot(gap[..., 0], gap[..., 1])
     error = np.where(np.isfinite(error), error, np.inf)
     full = np.concatenate([gap[..., :2], turn[..., None]], axis=-1)

@@ -4,7 +4,6 @@ import hashlib
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import jax
@@ -57,12 +56,10 @@ class Progress(NamedTuple):
     Attributes:
         variant: Number of the variant.
         done: Its trials that are done.
-        seconds: [s] that those of this call took.
     """
 
     variant: int
     done: int
-    seconds: float
 
 
 def run(
@@ -113,7 +110,6 @@ def _run_variant(
     first = sum(len(part.finite) for part in done)
     if jax.process_count() > 1:
         first = int(multihost_utils.broadcast_one_to_all(np.int32(first)))
-    begin = perf_counter()
     new: list[Outcomes] = []
     for result in _results(variant, seed, num_trials, first):
         new.append(outcomes_of(result))
@@ -124,7 +120,7 @@ def _run_variant(
             if leads and folder is not None:
                 _keep(folder, first, done[-1], mark)
         if callback is not None:
-            callback(Progress(number, first, perf_counter() - begin))
+            callback(Progress(number, first))
     return Outcomes(*(x[:num_trials] for x in concatenate(done)))
 
 

@@ -110,7 +110,7 @@ def medial_graph(grid: WallGrid, free: np.ndarray, stops: np.ndarray) -> MedialG
     pairs = np.array(list(shortest), int).reshape(-1, 2)
     values = np.array(list(shortest.values()), float)
     matrix = csr_array((values, tuple(pairs.T)), shape=(len(nodes), len(nodes)))
-    at_stop = np.unique(cKDTree(nodes).query(stops)[1], return_index=True)[1]
-    at_stop = cKDTree(nodes).query(stops)[1][np.sort(at_stop)]
+    near = cKDTree(nodes).query(stops)[1]
+    at_stop = near[np.sort(np.unique(near, return_index=True)[1])]
     length, previous = csgraph.dijkstra(matrix, indices=at_stop, return_predecessors=True)
     return MedialGraph(nodes, at_stop, arcs, length, previous)

@@ -98,6 +98,11 @@ def range_bearing(offset: Array) -> Array:
     return jnp.where(away, polar, 0.0)
 
 
+def vector_length(x: Array, y: Array) -> Array:
+    """Length of vectors, at least 1e-6, with finite derivatives."""
+    return jnp.sqrt(jnp.maximum(x * x + y * y, 1e-12))
+
+
 def unit_vector(angle: Array) -> Array:
     """Unit vector (..., 2) that points along `angle` (...) [rad]."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)

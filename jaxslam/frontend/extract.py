@@ -15,6 +15,7 @@ from jaxslam.core.types import Array
 from jaxslam.frontend import automaton, edge_codes, junctions, segmentation, voronoi
 from jaxslam.frontend.automaton import Diagram, EncodedDiagram
 from jaxslam.frontend.config import FrontendConfig, check_config
+from jaxslam.frontend.dropouts import fill_dropouts
 from jaxslam.frontend.features import find_corners, find_wall_directions
 from jaxslam.frontend.grid import rasterise, seen_free
 from jaxslam.frontend.lidar import begin_behind
@@ -152,6 +153,7 @@ def extract_levels(config: FrontendConfig, scan: Scan) -> tuple[Features, tuple[
     lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
     levels = config.pyramid()
     segments = segmentation.find_segments(lidar, config.segments, scan)
+    scan = fill_dropouts(lidar, config.segments, scan).scan
     grown = [grow(config._replace(lidar=lidar), level, scan, segments) for level in levels]
     cells = junction_cells(levels, [own for _, own in grown], [found.sources for found, _ in grown])
     features = concatenate_features(
@@ -174,6 +176,7 @@ def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, L
     """
     features, diagrams = extract_levels(config, scan)
     lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
+    scan = fill_dropouts(lidar, config.segments, scan).scan
     arcs = find_pyramid_arcs(lidar, config.pyramid(), config.features, features, diagrams, scan)
     return features, arcs
 

@@ -95,6 +95,7 @@ def partition_beams(
     lidar: Lidar,
     scan: Scan,
     breaks: Array,
+    measured: Array,
     range_std: float,
     *,
     segment_cost: float,
@@ -137,6 +138,7 @@ def partition_beams(
         lidar: The scanner.
         scan: The scan.
         breaks: (R,) bool, a segment must begin at this beam.
+        measured: (R,) bool; hits that are not measured begin no segment and cost nothing.
         range_std: [m] standard deviation of a range.
         segment_cost: Cost of a segment, in squared standard deviations.
         outlier_cost: Bound of the cost of one beam; a beam that reaches it does not change the
@@ -152,6 +154,7 @@ def partition_beams(
         cost, 2012.
     """
     q = 1.0 / jnp.maximum(scan.ranges, 0.02)
+    skipped = scan.hit & ~measured
     beam = jnp.arange(lidar.num_beams, dtype=jnp.int32)
     ray = unit_vector(beam_angles(lidar)).astype(q.dtype)
     candidate = jnp.arange(num_candidates, dtype=jnp.int32)
@@ -168,7 +171,7 @@ def partition_beams(
 
     def step(carry: _Carry, observed: tuple[Array, ...]) -> tuple[_Carry, tuple[Array, _Pair]]:
         old, least_cost, worst = carry
-        index, q, cosine, sine, must_begin = observed
+        index, q, cosine, sine, must_begin, skip = observed
         foot = jnp.sqrt(old.line[0] ** 2 + old.line[1] ** 2)
         extended = _add_beam(old, q, (cosine, sine), variance(q, foot), outlier_cost)
         extended = extended._replace(cost=jnp.where(must_begin, jnp.inf, extended.cost))
@@ -177,7 +180,10 @@ def partition_beams(
         begun = LineCandidates(
             least_cost + segment_cost, index, (cosine, sine), (q, zero), prior_cov
         )
-        new = jax.tree.map(lambda x, y: jnp.where(candidate == worst, x, y), begun, extended)
+        replaced = (candidate == worst) & ~skip
+        new = jax.tree.map(
+            lambda x, y, z: jnp.where(replaced, x, jnp.where(skip, z, y)), begun, extended, old
+        )
         best, worst = jnp.argmin(new.cost), jnp.argmax(new.cost).astype(jnp.int32)
         (cos0, sin0), (a, b) = jax.tree.map(lambda x: x[best], (new.heading, new.line))
         normal = cos0 * a - sin0 * b, sin0 * a + cos0 * b  # (a, b) turned to the robot frame
@@ -187,7 +193,7 @@ def partition_beams(
     unused = LineCandidates(one * jnp.inf, candidate, (one, zero), (zero, zero), (one, zero, one))
     must_begin = breaks | ~scan.hit
     start = unused, jnp.zeros((), q.dtype), jnp.int32(0)
-    _, (first, normal) = lax.scan(step, start, (beam, q, ray[:, 0], ray[:, 1], must_begin))
+    _, (first, normal) = lax.scan(step, start, (beam, q, ray[:, 0], ray[:, 1], must_begin, skipped))
     normals = jnp.stack(normal, axis=1)
     size = jnp.sqrt(jnp.maximum(dot(normals, normals), 1e-12))
     return Partition(_backtrack(beam, first), normals / size[:, None])

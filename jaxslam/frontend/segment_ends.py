@@ -5,31 +5,37 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxslam.core.scan import Lidar
+from jaxslam.core.se2 import vector_length
 from jaxslam.core.types import Array
 from jaxslam.frontend.line_fitting import BeamIntervals
 from jaxslam.frontend.segments import SegmentSpec
 
 
 class EndBeams(NamedTuple):
-    """First and last beam of each piece.
+    """First and last return of each piece.
 
     Attributes:
         first: (K,) int32 first beam.
         last: (K,) int32 last beam.
+        inner: (K, 2) int32 first return after the first beam, and last before the last one.
         x: (K, 2) [m] of the hits.
         y: (K, 2) [m] of the hits.
         ranges: (K, 2) [m].
-        range_beyond: (K, 2) [m] of the next beam outside the piece; 0 outside the field of view.
+        beyond: (K, 2) [m] range of the next return outside the piece, or of the next beam if that
+            begins more than a drop-out; 0 outside the field of view.
+        gap: (K, 2) number of beams to it.
         jump: (K, 2) 1.0 if a jump is between the two, else 0.0.
         normal: (K, 2) of the line that the partition fitted.
     """
 
     first: Array
     last: Array
+    inner: Array
     x: Array
     y: Array
     ranges: Array
-    range_beyond: Array
+    beyond: Array
+    gap: Array
     jump: Array
     normal: Array
 
@@ -62,11 +68,6 @@ class SegmentEnds(NamedTuple):
     cov_xx: Array
     cov_xy: Array
     cov_yy: Array
-
-
-def vector_length(x: Array, y: Array) -> Array:
-    """Length of vectors, at least 1e-6, with finite derivatives."""
-    return jnp.sqrt(jnp.maximum(x * x + y * y, 1e-12))
 
 
 def project_ends(end_beams: EndBeams, line: FittedLines, fitted: Array) -> tuple[Array, Array]:
@@ -156,7 +157,7 @@ def free_ends(
     An occluding end is on the near side of a jump: the beam beyond passes the wall. So the wall
     ends between the two beams, on average half their spacing on the wall beyond the last hit:
 
-        half = step / 2 * range / cos(incidence)
+        half = gap * step / 2 * range / cos(incidence)
 
     The covariance is n n' across + u u' (across + half^2 / 3), where `across` is the variance of
     the line at the end: along it, the end is uniform within +-half.
@@ -172,9 +173,9 @@ def free_ends(
     nx, ny = line.nx[:, None], line.ny[:, None]
     distance = vector_length(x, y)
     cos_incidence = jnp.abs(nx * x + ny * y) / jnp.maximum(distance, 1e-6)
-    half = 0.5 * lidar.angle_increment * distance / jnp.maximum(cos_incidence, 0.1)
+    half = 0.5 * lidar.angle_increment * end_beams.gap * distance / jnp.maximum(cos_incidence, 0.1)
     occluding = end_beams.jump > 0.0
-    occluding &= end_beams.ranges < jnp.minimum(end_beams.range_beyond, 0.9 * lidar.range_max)
+    occluding &= end_beams.ranges < jnp.minimum(end_beams.beyond, 0.9 * lidar.range_max)
     outwards = jnp.array([-1.0, 1.0], x.dtype)[None]
     shift = jnp.where(occluding & fitted[:, None], half, 0.0) * outwards
     x, y = x + ny * shift, y - nx * shift

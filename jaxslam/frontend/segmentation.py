@@ -8,6 +8,7 @@ from jaxslam.core.scan import Lidar, Scan, as_scan
 from jaxslam.core.se2 import dot, unit_vector
 from jaxslam.core.types import Array
 from jaxslam.frontend import line_fitting, segment_ends
+from jaxslam.frontend.dropouts import FilledScan, fill_dropouts
 from jaxslam.frontend.lidar import beam_angles, beam_ends
 from jaxslam.frontend.line_fitting import BeamIntervals
 from jaxslam.frontend.segment_ends import (
@@ -17,7 +18,6 @@ from jaxslam.frontend.segment_ends import (
     free_ends,
     project_ends,
     segment_corners,
-    vector_length,
 )
 from jaxslam.frontend.segments import Segments, SegmentSpec, check_segment_spec
 
@@ -28,51 +28,20 @@ class _Pieces(NamedTuple):
     Attributes:
         intervals: (K,) first and last beam.
         of_beam: (R,) int32 slot of each beam, K for none.
+        num_beams: (K,) int32 number of beams that returned.
         valid: (K,) bool.
-        fitted: (K,) bool, valid and of three beams or more: a line is fitted.
+        fitted: (K,) bool, valid and of three such beams or more: a line is fitted.
         overflow: () bool, there are more pieces than slots.
         surplus: () int32 slot of the fewest beams; if there are more pieces, it takes these too.
     """
 
     intervals: BeamIntervals
     of_beam: Array
+    num_beams: Array
     valid: Array
     fitted: Array
     overflow: Array
     surplus: Array
-
-
-def range_jumps(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Array:
-    """Whether the wall is interrupted before each beam (R,) bool.
-
-    On a straight wall, however grazing, 1 / r is a sinusoid of the bearing, so that
-    1 / r[i+1] + 1 / r[i-1] = 2 cos(step) / r[i]. Two successive hits that are far apart are no jump
-    if the two beams before them predict the second, or the two after them the first.
-    """
-    r = scan.ranges
-    xy = beam_ends(lidar, scan)
-    x, y = xy[:, 0], xy[:, 1]
-    wide = vector_length(x - jnp.roll(x, 1), y - jnp.roll(y, 1)) > spec.jump_distance
-    twice = 2 * jnp.cos(jnp.asarray(lidar.angle_increment, r.dtype))
-
-    def prediction_error(second: Array, nearest: Array, measured: Array) -> Array:
-        """Error [m] of a range from the nearest beam and the second, less that of roughness."""
-        inverse = twice / nearest - 1.0 / second
-        predicted = jnp.where(inverse > 0.0, 1.0 / jnp.maximum(inverse, 1e-6), jnp.inf)
-        # An offset of the wall changes a range by 1 / cos(angle of incidence) times as much.
-        slant = vector_length(nearest - second, nearest * lidar.angle_increment) / (
-            nearest * lidar.angle_increment
-        )
-        return jnp.abs(predicted - measured) - 2.0 * spec.roughness_std * slant
-
-    # Beam i from i-1 and i-2, and beam i-1 from i and i+1.
-    forward = prediction_error(jnp.roll(r, 2), jnp.roll(r, 1), r)
-    backward = prediction_error(jnp.roll(r, -1), r, jnp.roll(r, 1))
-    # Two ranges of noise s extrapolate with about 2.2 s; a far wall may also bend a little.
-    tolerance = 5.0 * lidar.range_std + 0.05 * jnp.abs(r - jnp.roll(r, 1))
-    smooth = (forward < tolerance) | (backward < tolerance)
-    broken = ~scan.hit | ~jnp.roll(scan.hit, 1) | (wide & ~smooth)
-    return broken.at[0].set(True)
 
 
 def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
@@ -95,7 +64,8 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
 
     Steps:
 
-    1. Split the beams at jumps and where straight lines fit best (`line_fitting.partition_beams`).
+    1. Fill drop-outs and split the beams at jumps (`dropouts.fill_dropouts`), and where straight
+       lines fit best (`line_fitting.partition_beams`).
     2. Give the pieces with most beams a slot each (`_longest_pieces`). If there are more than
        `max_segments`, the slot of the fewest beams takes all others too, and is not valid: its
        beams are obstacles without a line.
@@ -115,13 +85,14 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
     """
     check_segment_spec(spec)
     scan = as_scan(lidar, scan)
-    xy = beam_ends(lidar, scan)
-    jump = range_jumps(lidar, spec, scan)
+    filled = fill_dropouts(lidar, spec, scan)
+    xy = beam_ends(lidar, filled.scan)
     noise = max(lidar.range_std, 0.005)
     cut = line_fitting.partition_beams(
         lidar,
-        scan,
-        jump,
+        filled.scan,
+        filled.jump,
+        filled.measured,
         noise,
         segment_cost=spec.segment_cost,
         outlier_cost=spec.outlier_cost,
@@ -129,10 +100,16 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
         roughness_std=spec.roughness_std,
         roughness_length=spec.roughness_length,
     )
-    pieces = _longest_pieces(cut.begins, scan.hit, spec.max_segments)
-    end_beams = _end_beams(scan.ranges, xy, jump, cut.normal, pieces.intervals)
+    pieces = _longest_pieces(cut.begins, filled, spec.max_segments)
+    end_beams = _end_beams(filled, xy, cut.normal, pieces.intervals)
     line = _fit_lines(
-        xy, unit_vector(beam_angles(lidar)).astype(xy.dtype), pieces, end_beams, noise, spec
+        xy,
+        unit_vector(beam_angles(lidar)).astype(xy.dtype),
+        filled,
+        pieces,
+        end_beams,
+        noise,
+        spec,
     )
     x, y = project_ends(end_beams, line, pieces.fitted)
     adjacent = segment_ends.adjacent(pieces.intervals, end_beams)
@@ -144,7 +121,7 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
     at_corner = jnp.stack([jnp.roll(at_corner, 1, axis=1), at_corner], axis=2)  # (6, K, 2)
     ends = SegmentEnds(*jnp.where(at_corner[5:] > 0.0, at_corner[:5], jnp.stack(free)))
     cov = jnp.stack([ends.cov_xx, ends.cov_xy, ends.cov_xy, ends.cov_yy], axis=2)
-    surplus_beam = scan.hit & (pieces.of_beam == spec.max_segments) & pieces.overflow
+    surplus_beam = filled.scan.hit & (pieces.of_beam == spec.max_segments) & pieces.overflow
     return Segments(
         normal=jnp.stack([line.nx, line.ny], axis=1),
         centre=line.centre,
@@ -154,69 +131,85 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
         end_occludes=occluding,
         offset_variance=line.offset_variance,
         angle_variance=line.angle_variance,
-        num_beams=pieces.intervals.size,
+        num_beams=pieces.num_beams,
         meets_next=meets,
         valid=pieces.valid,
         segment_of_beam=jnp.where(surplus_beam, pieces.surplus, pieces.of_beam),
     )
 
 
-def _longest_pieces(begins: Array, hit: Array, capacity: int) -> _Pieces:
+def _longest_pieces(begins: Array, filled: FilledScan, capacity: int) -> _Pieces:
     """The `capacity` pieces with most beams.
 
     Args:
         begins: (R,) bool, a piece begins at this beam.
-        hit: (R,) bool, the beam returned.
+        filled: The scan.
         capacity: K.
     """
+    hit = filled.scan.hit
     intervals = line_fitting.longest_intervals(begins, hit, capacity=capacity)
     fewest = jnp.argmin(intervals.size).astype(jnp.int32)
     overflow = jnp.sum(begins & hit, dtype=jnp.int32) > capacity
     own = ~(overflow & (jnp.arange(capacity, dtype=jnp.int32) == fewest))
+    up_to = jnp.append(jnp.int32(0), jnp.cumsum(filled.measured, dtype=jnp.int32))
+    num_beams = up_to[intervals.last + 1] - up_to[jnp.minimum(intervals.first, hit.size)]
+    num_beams = jnp.maximum(num_beams, 0)
     return _Pieces(
         intervals=intervals,
         of_beam=intervals.interval_of_beam(hit.size),
-        valid=own & (intervals.size > 0),
-        fitted=own & (intervals.size >= 3),
+        num_beams=num_beams,
+        valid=own & (num_beams > 0),
+        fitted=own & (num_beams >= 3),
         overflow=overflow,
         surplus=fewest,
     )
 
 
-def _end_beams(
-    ranges: Array, xy: Array, jump: Array, normal: Array, intervals: BeamIntervals
-) -> EndBeams:
-    """First and last beam of each piece and what is beside them, by one gather.
+def _end_beams(filled: FilledScan, xy: Array, normal: Array, intervals: BeamIntervals) -> EndBeams:
+    """First and last returns of each piece and what is beside them, by one gather.
+
+    A piece begins with a return, but may go on after its last one, to where the next begins.
 
     Args:
-        ranges: (R,) [m].
+        filled: The scan.
         xy: (R, 2) [m] hits.
-        jump: (R,) bool, of `range_jumps`.
         normal: (R, 2), of `Partition`.
         intervals: (K,) first and last beams.
     """
-    jump = jump.astype(ranges.dtype)
-    before = jnp.stack([jnp.roll(ranges, 1), jump], axis=1)
-    after = jnp.stack([jnp.roll(ranges, -1), jnp.append(jump[1:], 1.0)], axis=1)
-    # Range 0 outside the field of view: no wall ends there, only the view of it.
-    before, after = before.at[0].set(0.0), after.at[-1, 0].set(0.0)
-    table = jnp.concatenate([xy, normal, ranges[:, None], before, after], axis=1)
-    first, last = jnp.minimum(intervals.first, ranges.size - 1), jnp.maximum(intervals.last, 0)
-    beams = table[jnp.stack([first, last], axis=1)]  # (K, 2, 9)
+    count = filled.measured.size
+    end = jnp.clip(intervals.last, 0, count - 1)
+    first = jnp.minimum(intervals.first, count - 1)
+    last = jnp.where(filled.measured[end], end, jnp.maximum(filled.previous[end], 0))
+    beam = jnp.stack([first, last], axis=1)
+    jump = filled.jump.astype(xy.dtype)
+    # No wall ends outside the field of view, only the view of it: there is a jump.
+    jumps = jnp.stack([jump, jnp.append(jump[1:], 1.0)], axis=1)
+    gap = filled.gap.astype(xy.dtype)
+    own = [xy, normal, filled.scan.ranges[:, None], filled.beyond, gap]
+    beams = jnp.concatenate(own, axis=1)[beam]  # (K, 2, 9)
+    side = jnp.arange(2)
     return EndBeams(
         first=first,
         last=last,
+        inner=jnp.stack([filled.following[first], filled.previous[last]], axis=1),
         x=beams[:, :, 0],
         y=beams[:, :, 1],
         ranges=beams[:, :, 4],
-        range_beyond=jnp.stack([beams[:, 0, 5], beams[:, 1, 7]], axis=1),
-        jump=jnp.stack([beams[:, 0, 6], beams[:, 1, 8]], axis=1),
+        beyond=jnp.stack([beams[:, 0, 5], beams[:, 1, 6]], axis=1),
+        gap=jnp.stack([beams[:, 0, 7], beams[:, 1, 8]], axis=1),
+        jump=jumps[jnp.stack([first, end], axis=1), side[None]],
         normal=beams[:, 1, 2:4],
     )
 
 
 def _fit_lines(
-    xy: Array, ray: Array, pieces: _Pieces, end_beams: EndBeams, noise: float, spec: SegmentSpec
+    xy: Array,
+    ray: Array,
+    filled: FilledScan,
+    pieces: _Pieces,
+    end_beams: EndBeams,
+    noise: float,
+    spec: SegmentSpec,
 ) -> FittedLines:
     """Weighted total least squares: one line for each piece.
 
@@ -229,23 +222,26 @@ def _fit_lines(
     Args:
         xy: (R, 2) [m] hits.
         ray: (R, 2) unit vectors of the beams.
+        filled: The scan; only beams that returned count.
         pieces: The pieces.
         end_beams: Their outermost beams.
         noise: [m] standard deviation of a range.
         spec: Parameters.
     """
-    count, of_beam = pieces.intervals.size, pieces.of_beam
-    trim = jnp.where(count >= 6, 1, 0)
-    inner = jnp.stack([end_beams.first + trim, end_beams.last - trim], axis=1)
+    count, of_beam = pieces.num_beams, pieces.of_beam
+    trim = count >= 6
+    outermost = jnp.stack([end_beams.first, end_beams.last], axis=1)
+    inner = jnp.where(trim[:, None], end_beams.inner, outermost)
     inner = inner.at[of_beam].get(mode="clip")  # (R, 2)
     beam = jnp.arange(of_beam.size, dtype=jnp.int32)
-    used = (of_beam < spec.max_segments) & (beam >= inner[:, 0]) & (beam <= inner[:, 1])
+    used = filled.measured & (of_beam < spec.max_segments)
+    used &= (beam >= inner[:, 0]) & (beam <= inner[:, 1])
     cos_incidence = dot(end_beams.normal.at[of_beam].get(mode="clip"), ray)
     weight = jnp.where(used, 1.0 / ((noise * cos_incidence) ** 2 + spec.point_std**2), 0.0)
     sums = line_fitting.line_moments(xy, weight, of_beam, lines=spec.max_segments)
     normal, chi_square, spread = line_fitting.principal_axes(sums.scatter)
     sign = jnp.where(dot(normal, sums.mean) > 0.0, -1.0, 1.0)  # towards the robot
-    degrees = jnp.maximum(count - 2 * trim - 2, 0).astype(xy.dtype)
+    degrees = jnp.maximum(count - jnp.where(trim, 4, 2), 0).astype(xy.dtype)
     scale = (4.0 + chi_square) / (4.0 + degrees)
     return FittedLines(
         nx=sign * normal[:, 0],

@@ -30,7 +30,7 @@ class Segments(NamedTuple):
         end_occludes: (K, 2) bool, occluding end: what lies behind it is hidden by the wall.
         offset_variance: (K,) [m^2] variance of the line across itself, at `centre`.
         angle_variance: (K,) [rad^2] variance of its direction.
-        num_beams: (K,) int32 number of beams.
+        num_beams: (K,) int32 number of beams that returned.
         meets_next: (K,) bool, this segment meets the next one in a corner, at `ends[:, 1]`.
         valid: (K,) bool, False for padding and for the slot of all surplus segments.
         segment_of_beam: (R,) int32 segment of each beam, K for none.
@@ -77,6 +77,8 @@ class SegmentSpec(NamedTuple):
     Attributes:
         max_segments: K, most segments, at most `MAX_SEGMENTS`.
         jump_distance: [m] two successive hits nearer to each other than this are never a jump.
+        max_gap: [m] beams that do not return are no opening if they leave open less than this,
+            across the beams; 0: each of them is one.
         segment_cost: Cost of a segment, in squared standard deviations.
         outlier_cost: Bound of the cost of one beam, in squared standard deviations.
         num_candidates: Candidates that the partition keeps at each beam.
@@ -89,6 +91,7 @@ class SegmentSpec(NamedTuple):
 
     max_segments: int = 48
     jump_distance: float = 0.2
+    max_gap: float = 0.4
     segment_cost: float = 20.0
     outlier_cost: float = 16.0
     num_candidates: int = 16

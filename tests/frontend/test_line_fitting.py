@@ -44,6 +44,7 @@ def partition(
             SMALL,
             scan,
             breaks,
+            hit,
             0.01,
             segment_cost=segment_cost,
             outlier_cost=outlier_cost,

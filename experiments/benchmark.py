@@ -1,6 +1,7 @@
 """Speed of the whole chain, of the front end and of the automaton, on one core, after compilation.
 
-Ray casting, front end and filter of trials of the office drive; the stages of the front end; the
+Ray casting, front end and filter of trials of the office drive, also in life and with 5,000 walls
+(`life_benchmark`); the stages of the front end; the
 automaton, and the filter with its gradient, beside hand-written C and other libraries
 (`pip install '.[bench]'`). Seconds depend on the machine; shares and ratios, measured in one
 process, depend on it little.
@@ -15,7 +16,7 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-from experiments import common, filter_benchmark, peer_automata, peer_filters
+from experiments import common, filter_benchmark, life_benchmark, peer_automata, peer_filters
 from experiments.timing import fastest, pin, seconds
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
@@ -166,6 +167,7 @@ def compute(seed: int, num_trials: int, maps: int, drives: int, repeats: int) ->
         "seed": seed,
         "cores": 1,
         "chain": of_chain,
+        "life": life_benchmark.compute(seed, num_trials, repeats),
         "front_end": frontend(scans, maps, repeats),
         "estimator": of_filter,
     }
@@ -226,6 +228,12 @@ def main(argv: list[str] | None = None) -> None:
     of_chain, of_front = numbers["chain"], numbers["front_end"]
     print(f"{of_chain['scans_per_second']:.0f} scans per second on one core")
     print(percent(of_chain["share_of_chain"]))
+    in_life = numbers["life"]
+    print(
+        f"{in_life['walls']} walls, {in_life['people']} people and faults: "
+        f"{in_life['in_life_vs_office']:.2f} of the scans per second; ray casting "
+        f"{in_life['rays_vs_brute_force']:.0f} times as fast as wall by wall"
+    )
     print(
         f"front end: {of_front['scans_per_s']:.0f} scans per second",
         percent(stage_names(of_front["share"])),

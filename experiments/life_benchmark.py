@@ -9,12 +9,16 @@ import numpy as np
 
 from experiments import common
 from experiments.timing import fastest
+from jaxslam.core import polylines
 from jaxslam.core.batching import map_batches
+from jaxslam.core.episode import Episode
+from jaxslam.core.types import Array
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.extract import SCAN_BATCH
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import (
+    Life,
     RangeErrors,
     Traffic,
     WheelFaults,
@@ -24,23 +28,13 @@ from jaxslam.simulation import (
     trials,
     with_index,
 )
+from jaxslam.simulation.named_worlds import named_path, named_world
 
-NUM_WALLS = 5000
+BUILDING = "random:1:100x60"  # of 5,918 walls
+PATH_LENGTH = 75.0  # [m] of its patrol, as long as the drive of the office
 RANGES = RangeErrors(std_by_incidence=0.5, spot=0.003, missing=0.1, black=0.05, glass=0.05)
 TRAFFIC = Traffic(people=10)
 WHEELS = WheelFaults(slip=0.02, carpet=0.2, lost=0.002, dropped=0.02)
-
-
-def cut(walls: np.ndarray, count: int) -> np.ndarray:
-    """About `count` walls (S, 4) [m] that cover the same lines: longer ones in more pieces."""
-    length = np.hypot(*(walls[:, 2:] - walls[:, :2]).T)
-    pieces = np.maximum(np.round(length / length.sum() * count).astype(int), 1)
-    found = []
-    for wall, number in zip(walls, pieces, strict=True):
-        share = np.linspace(0.0, 1.0, number + 1)[:, None]
-        points = wall[:2] + share * (wall[2:] - wall[:2])
-        found.append(np.hstack([points[:-1], points[1:]]))
-    return np.concatenate(found)
 
 
 def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
@@ -56,40 +50,45 @@ def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     office, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
     keys = trials.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    walls = cut(np.asarray(office.walls), NUM_WALLS)
-    plain = World(jnp.asarray(walls, float))
+    plain = World(jnp.asarray(named_world(BUILDING).walls, float))
     indexed = with_index(plain, lidar.range_max)
-    life = life_in(plain, path, ranges=RANGES, traffic=TRAFFIC, wheels=WHEELS)
+    patrol = named_path(BUILDING)
+    patrol = patrol[polylines.cumulative_lengths(patrol) < PATH_LENGTH]
+    life = life_in(plain, patrol, ranges=RANGES, traffic=TRAFFIC, wheels=WHEELS)
 
-    def chain(world: World, **more: Any) -> Any:
-        simulated = trials.simulate_keys(
-            keys, config, robot, world, path, num_scans=num_scans, **more
+    def simulate(world: World, path: Any, life: Life | None = None) -> Episode:
+        return trials.simulate_keys(
+            keys, config, robot, world, path, num_scans=num_scans, life=life
         )
-        return episodes.filter_episodes(config, params, simulated)
 
-    simulated = trials.simulate_keys(keys, config, robot, office, path, num_scans=num_scans)
-    poses = simulated.truth.reshape(-1, 3)
+    def chain(*arguments: Any) -> Any:
+        return episodes.filter_episodes(config, params, simulate(*arguments))
 
-    def ray_casting(world: World) -> Any:
-        casting = jax.jit(partial(map_batches, partial(cast, lidar, world), batch_size=SCAN_BATCH))
-        return casting, poses
+    patrol = jnp.asarray(patrol, float)
+    poses = {
+        "office": simulate(office, path).truth.reshape(-1, 3),
+        "building": simulate(indexed, patrol).truth.reshape(-1, 3),
+    }
+
+    def ray_casting(world: World, poses: Array) -> Any:
+        casting = partial(map_batches, partial(cast, lidar, world), batch_size=SCAN_BATCH)
+        return jax.jit(casting), poses
 
     taken = fastest(
         {
-            "office": (chain, office),
-            "in_life": (partial(chain, life=life), indexed),
-            "rays_office": ray_casting(office),
-            "rays": ray_casting(indexed),
+            "office": (chain, office, path),
+            "in_life": (chain, indexed, patrol, life),
+            "rays_office": ray_casting(office, poses["office"]),
+            "rays": ray_casting(indexed, poses["building"]),
         },
         repeats=repeats,
     )
-    few = poses[: 4 * SCAN_BATCH]
-    slow = jax.jit(partial(map_batches, partial(cast, lidar, plain), batch_size=SCAN_BATCH))
-    brute_force = fastest({"rays": (slow, few)}, repeats=repeats)["rays"] / len(few)
-    count = len(poses)
+    few = poses["building"][: 4 * SCAN_BATCH]
+    brute_force = fastest({"rays": ray_casting(plain, few)}, repeats=repeats)["rays"] / len(few)
+    count = len(poses["office"])
     us = {name: 1e6 * taken[name] / count for name in ("rays_office", "rays")}
     return {
-        "walls": len(walls),
+        "walls": len(plain.walls),
         "office_walls": len(office.walls),
         "people": TRAFFIC.people,
         "scans": count,

@@ -37,6 +37,7 @@ class Variant(NamedTuple):
         path: (N, 2) [m, world] that it drives.
         num_scans: T, scans of a trial.
         life: What may go wrong; None: nothing.
+        cost: In any currency; None: not known.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Variant(NamedTuple):
     path: np.ndarray
     num_scans: int
     life: Life | None = None
+    cost: float | None = None
 
 
 class Progress(NamedTuple):

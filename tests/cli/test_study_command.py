@@ -47,8 +47,11 @@ def said_of(folder, text, capsys, *more):
         ('path = "none.csv"\n', "none.csv"),
         ('scanner = "LDS-9"\n', "s.toml: base: no scanner named 'LDS-9'; there are: LDS-01"),
         ('robot = "r.toml"\n', "r.toml"),
-        ('path = "p.csv"\nlife.closed = 0.2\n', "life.closed needs doors, and those of office are"),
-        ('path = "p.csv"\nlife.moved_at = 9\n', "life.moved_at needs furniture"),
+        ('world = "fig07"\npath = "p.csv"\nlife.closed = 0.2\n', "closed needs doors, and none"),
+        ('path = "p.csv"\nlife.moved_at = 9\n', "life.moved_at: says nothing without life.moved;"),
+        ('path = "p.csv"\nlife.moved = 1\n', "life.moved: says nothing without life.moved_at;"),
+        ('path = "p.csv"\nlife = "none.toml"\n', "none.toml: does not exist"),
+        ('path = "p.csv"\nscanner = "LDS-01"\nscan_period = 0.05\n', "LDS-01 scans every 0.2 s"),
         ('path = "p.csv"\nodometry_factor = 0\n', "odometry_factor and sensor_factor are above 0"),
         ('path = "p.csv"\ndrive = "route"\n', "--drive: is not for a drive that --path gives"),
         ('path = "p.csv"\nscan_period = 0\n', "robot.scan_period is 0.0, not above 0"),
@@ -85,10 +88,22 @@ def test_variants_have_the_settings_of_the_study(folder):
     assert study_variants.prepare(study_file.read(folder / "s.toml")).variants[0].life is None
 
 
-def test_doors_of_a_random_building_are_in_its_openings():
-    doors = study_variants.doors_of("random:3")
-    length = np.hypot(*(doors[:, 2:] - doors[:, :2]).T)
-    assert len(doors) > 3 and length.min() > 0.7 and length.max() < 1.3
+def test_a_value_that_is_the_default_is_no_other_variant(folder, capsys):
+    base = '[base]\npath = "p.csv"\n[[variant]]\nname = "as it is"\n'
+    other = '[[variant]]\nname = "so fast"\nmax_speed = 0.6\n'
+    assert "variants: 'as it is' and 'so fast' are the same" in said_of(
+        folder, base + other, capsys
+    )
+
+
+def test_a_file_of_life_is_that_of_simulate(folder, capsys):
+    (folder / "life.toml").write_text('people = 3\nmissing = "10 %"\n')
+    text = '[base]\npath = "p.csv"\nlife = "life.toml"\n[vary]\nlife.missing = [0, 0.2]\n'
+    (folder / "s.toml").write_text(text)
+    found = study_variants.prepare(study_file.read(folder / "s.toml"))
+    assert [float(one.life.ranges.missing) for one in found.variants] == [0.0, 0.2]
+    assert all(float(one.life.traffic.people) == 3.0 for one in found.variants)
+    assert "missing 0: life: people 3, missing 0" in found.notes
 
 
 @pytest.mark.slow

@@ -1,12 +1,11 @@
 """Outcome of each trial of a study, and what many of them say together."""
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam.core import se2_np
 from jaxslam.core.types import Metrics
+from jaxslam.evaluation import consistency
 from jaxslam.evaluation.consistency import CERTAIN_TRACE
 from jaxslam.evaluation.trial_statistics import (
     Interval,
@@ -44,35 +43,26 @@ class Outcomes(NamedTuple):
 
 def outcomes_of(result: TrialResult) -> Outcomes:
     """Outcomes of some trials, whose scans are all there and whose truth is known."""
-    truth, estimate, cov = (np.asarray(x) for x in (result.truth, result.estimate, result.cov))
-    gap = (estimate - truth).astype(np.float64)
-    turn = se2_np.wrap_angle(gap[..., 2])
+    truth, cov = np.asarray(result.truth), np.asarray(result.cov)
+    with np.errstate(invalid="ignore"):
+        gap = np.asarray(consistency.pose_error(result.estimate, result.truth), np.float64)
     error = np.hypot(gap[..., 0], gap[..., 1])
     error = np.where(np.isfinite(error), error, np.inf)
-    full = np.concatenate([gap[..., :2], turn[..., None]], axis=-1)
-    usable = np.isfinite(full).all(axis=-1) & np.isfinite(cov).all(axis=(-2, -1))
-    usable &= np.trace(cov, axis1=-2, axis2=-1) >= CERTAIN_TRACE
-    safe_cov = np.where(usable[..., None, None], cov, np.eye(3)).astype(np.float64)
-    safe = np.where(usable[..., None], full, 0.0)
-    with np.errstate(all="ignore"):
-        solved = np.linalg.solve(safe_cov, safe[..., None])[..., 0]
-    value = np.sum(safe * solved, axis=-1) / 3
+    turn = np.where(np.isfinite(gap[..., 2]), gap[..., 2], np.pi)
+    value = np.asarray(consistency.nees(gap, cov), np.float64)
+    usable = np.isfinite(value) & (np.trace(cov, axis1=-2, axis2=-1) >= CERTAIN_TRACE)
     count = usable.sum(axis=1)
-    nees = np.where(count > 0, value.sum(axis=1) / np.maximum(count, 1), np.nan)
+    total = consistency.nees_per_dof(np.where(usable, value, 0.0).sum(axis=1))
+    nees = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return Outcomes(
         error.astype(np.float32),
         truth[..., :2].astype(np.float32),
-        np.sqrt(np.mean(np.where(np.isfinite(turn), turn, np.pi) ** 2, axis=1)),
+        np.sqrt(np.mean(turn**2, axis=1)),
         nees,
         np.asarray(result.finite) & np.isfinite(error).all(axis=1),
         np.asarray(result.num_updates).mean(axis=1),
         np.asarray(result.num_landmarks),
     )
-
-
-def concatenate(parts: Iterable[Outcomes]) -> Outcomes:
-    """Join the outcomes of groups of trials."""
-    return Outcomes(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 def failed_at(outcomes: Outcomes, success_distance: float) -> np.ndarray:

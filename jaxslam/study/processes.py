@@ -53,6 +53,30 @@ def local(count: int) -> Group:
         return Group(f"{LOOPBACK}:{free.getsockname()[1]}", count, range(count))
 
 
+def group_of(
+    count: int, address: str, total: int, number: int, names: Sequence[str]
+) -> Group | None:
+    """The processes that some options ask for; None for this one alone.
+
+    Args:
+        count: Processes of this machine, that work together.
+        address: HOST:PORT of process 0, of several machines; empty for this machine alone.
+        total: Number of processes on all machines.
+        number: Of the one to start here.
+        names: Of the last three options, for messages.
+
+    Raises:
+        InputError: The options do not fit together.
+    """
+    if not address:
+        if total or number >= 0:
+            raise InputError("is missing", field=names[0])
+        return local(count) if count > 1 else None
+    if not 0 <= number < total:
+        raise InputError(f"is not below {names[1]}", field=names[2])
+    return Group(address, total, (number,))
+
+
 def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
     """Call `work(*arguments, stream=...)` in every process; return the results of those of here.
 

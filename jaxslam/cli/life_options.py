@@ -92,8 +92,7 @@ def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
     poses = jnp.asarray(np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])]), float)
     for mount in (robot.nominal_mount, robot.mount):
         poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(mount, float))
-    found = ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
-    return Leaving(*(np.asarray(x) for x in found))
+    return ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
 
 
 def leaving_note(found: Leaving, range_max: float) -> str:

@@ -8,10 +8,14 @@ from jaxslam.core.types import Metrics
 from jaxslam.evaluation import consistency
 from jaxslam.evaluation.consistency import CERTAIN_TRACE
 from jaxslam.evaluation.trial_statistics import (
+    Difference,
     Interval,
+    mean_interval,
+    p_value_of_mean,
     paired_difference,
     proportion,
     quantile,
+    share_difference,
     survival,
 )
 from jaxslam.pipeline.episodes import TrialResult
@@ -71,6 +75,11 @@ def failed_at(outcomes: Outcomes, success_distance: float) -> np.ndarray:
     return np.where(far.any(axis=1), far.argmax(axis=1), far.shape[1])
 
 
+def succeeded(outcomes: Outcomes, success_distance: float) -> np.ndarray:
+    """Which trials (N,) are never further off than `success_distance` [m]."""
+    return np.asarray((outcomes.error <= success_distance).all(axis=1))
+
+
 def position_rmse(outcomes: Outcomes) -> np.ndarray:
     """Position RMSE (N,) [m] of each trial, infinite where an estimate is not finite."""
     return np.sqrt(np.mean(outcomes.error.astype(np.float64) ** 2, axis=1))
@@ -108,16 +117,29 @@ def summarise(outcomes: Outcomes, *, success_distance: float, scan_period: float
 def compare(first: Outcomes, second: Outcomes, *, success_distance: float) -> Metrics:
     """Differences of the second variant from the first, over trials with the same numbers.
 
-    The RMSE is compared by the mean of its logarithm: `ratio` is that of typical errors.
+    The RMSE is compared by the mean of its logarithm: `position_rmse_ratio` is that of typical
+    errors, over trials in which both are finite.
     """
-    ok = [failed_at(x, success_distance) == x.error.shape[1] for x in (first, second)]
+    ok = [succeeded(x, success_distance) for x in (first, second)]
     success = paired_difference(*(x.astype(float) for x in ok))
+    share = share_difference(*ok)
     with np.errstate(divide="ignore"):
         rmse = paired_difference(*(np.log(position_rmse(x)) for x in (first, second)))
     return {
-        "success": success._asdict(),
+        "success": success._asdict() | share._asdict(),
         "log_position_rmse": rmse._asdict(),
-        "position_rmse_ratio": float(np.exp(rmse.mean)),
+        **ratio_of(rmse),
+    }
+
+
+def ratio_of(log_rmse: Difference) -> Metrics:
+    """Ratio of typical errors, with its interval and p-value, of the difference of logarithms."""
+    given = log_rmse.mean, log_rmse.standard_error, log_rmse.pairs
+    low, high = mean_interval(*given)
+    return {
+        "position_rmse_ratio": float(np.exp(log_rmse.mean)),
+        "position_rmse_ratio_interval": [float(np.exp(low)), float(np.exp(high))],
+        "position_rmse_p_value": p_value_of_mean(*given),
     }
 
 

@@ -33,12 +33,12 @@ class Group(NamedTuple):
 
     Attributes:
         address: HOST:PORT at which process 0 coordinates them.
-        count: Number of processes.
+        total: Number of processes.
         own: Numbers of those started here.
     """
 
     address: str
-    count: int
+    total: int
     own: Sequence[int]
 
 
@@ -93,7 +93,8 @@ def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
     spawn = get_context("spawn")
     cores = max(1, num_cores() // len(group.own))
     logs = Path(tempfile.mkdtemp(prefix="processes-"))
-    children, results = {}, {}
+    children: dict[int, tuple] = {}
+    results: dict[int, Any] = {}
     # Ctrl-C reaches all processes of a terminal; only this one handles it.
     handler = _ignore_interrupts()
     try:
@@ -124,7 +125,7 @@ def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
 
 def _follow(group: Group, children: dict, results: dict, deadline: float, logs: Path) -> None:
     """Collect results of the children until all are complete, or one is lost."""
-    started = set()
+    started: set[int] = set()
     while pending := {k: c for k, c in children.items() if k not in results}:
         left = None if len(started) == len(children) else max(0.0, deadline - monotonic())
         events = [x for child, pipe in pending.values() for x in (child.sentinel, pipe)]
@@ -158,12 +159,12 @@ def _early(group: Group, ended: list, started: set[int], logs: Path) -> LostProc
             return _missing(group)
         why = "it has lost another one"
     why = f"exit code {why}" if isinstance(why, int) else why
-    return LostProcessError(f"process {number} of {group.count} ended early ({why}); see {logs}")
+    return LostProcessError(f"process {number} of {group.total} ended early ({why}); see {logs}")
 
 
 def _missing(group: Group) -> LostProcessError:
     return LostProcessError(
-        f"not all of {group.count} processes came up at {group.address}; start every one"
+        f"not all of {group.total} processes came up at {group.address}; start every one"
     )
 
 
@@ -199,7 +200,7 @@ def _child(
         bind = group.address if group.address.startswith(LOOPBACK) else None
         jax.distributed.initialize(
             group.address,
-            group.count,
+            group.total,
             number,
             cluster_detection_method="deactivate",
             initialization_timeout=int(wait) + 1,
@@ -228,7 +229,9 @@ def _leave(pipe: connection.Connection, message: tuple[str, str]) -> None:
 
 
 def _end_with_parent() -> None:
-    connection.wait([parent_process().sentinel])
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
     os._exit(1)
 
 

@@ -1,10 +1,11 @@
-"""The page of a study: success, errors and times of its variants, and where trials fail."""
+"""Pictures of a study: success, errors and times of its variants, cost, and where trials fail."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from jaxslam.core.types import AnyArray, Metrics
@@ -19,37 +20,84 @@ class StudyPage(NamedTuple):
     """What a page shows.
 
     Attributes:
-        names: (V,) of the variants.
-        summaries: (V,) as `study.summarise` makes them.
-        walls: (S, 4) [m] of the building of the variant that is mapped.
-        mapped: Its number.
-        places: Where its trials fail, as of `study.failures_by_place`.
-        seconds: [s] that a trial of it lasts.
+        rows: (V,) of the variants, as `study.report` makes them.
+        walls: (V,) of each the walls (S, 4) [m].
+        mapped: Number of the variant whose failures are mapped.
+        seconds: [s] that the longest trial lasts.
     """
 
-    names: Sequence[str]
-    summaries: Sequence[Metrics]
-    walls: AnyArray
+    rows: Sequence[Metrics]
+    walls: Sequence[AnyArray]
     mapped: int
-    places: Metrics
     seconds: float
 
 
 def study_page(page: StudyPage) -> Figure:
     """Draw the page of a study; of more than `MAX_SHOWN` variants the first ones."""
-    shown = min(len(page.names), MAX_SHOWN)
+    shown = min(len(page.rows), MAX_SHOWN)
     rows = 1.6 + 0.24 * shown
     figure = Figure(figsize=(11, rows + 5.6), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=[rows, 5.0])
     success, errors = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-    names = [_short(name) for name in page.names[:shown]]
-    summaries = page.summaries[:shown]
+    names = [_short(row["name"]) for row in page.rows[:shown]]
+    summaries = page.rows[:shown]
     _draw_success(success, names, summaries)
     _draw_quantiles(errors, summaries)
     _draw_survival(figure.add_subplot(grid[1, 0]), names, summaries, page.seconds)
-    _draw_places(figure.add_subplot(grid[1, 1]), page)
-    if shown < len(page.names):
-        figure.suptitle(f"the first {shown} of {len(page.names)} variants", fontsize=9)
+    _draw_places(figure.add_subplot(grid[1, 1]), page, page.mapped)
+    if shown < len(page.rows):
+        figure.suptitle(f"the first {shown} of {len(page.rows)} variants", fontsize=9)
+    return figure
+
+
+def cost_picture(rows: Sequence[Metrics]) -> Figure | None:
+    """Success of variants against their costs, joined where no other does better for less.
+
+    None where costs are not known.
+    """
+    if not all("cost" in row for row in rows):
+        return None
+    figure = Figure(figsize=(8, 4.6), dpi=100, layout="constrained")
+    axis = figure.subplots()
+    cost = np.array([row["cost"] for row in rows], float)
+    found = [row["success"] for row in rows]
+    value, low, high = (np.array([one[key] for one in found]) for key in ("value", "low", "high"))
+    spread = np.maximum([value - low, high - value], 0.0)
+    axis.errorbar(cost, value, yerr=spread, fmt="o", color=BLUE, ecolor=GREY, capsize=2)
+    front = pareto_front(cost, value)
+    axis.step(cost[front], value[front], where="post", color=ORANGE, linewidth=1.2)
+    for number in front:
+        offset = (5, -11) if value[number] > 0.9 else (5, 5)
+        axis.annotate(
+            _short(rows[number]["name"]),
+            (cost[number], value[number]),
+            textcoords="offset points",
+            xytext=offset,
+            fontsize=8,
+        )
+    axis.set(xlabel="cost", ylabel="trials that succeed, with 95 % intervals", ylim=(-0.03, 1.05))
+    axis.margins(x=0.15)
+    axis.grid(alpha=0.3)
+    return figure
+
+
+def pareto_front(cost: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Numbers of those (K,) that no other beats for as little cost, cheapest first."""
+    order = np.lexsort([-value, cost])
+    best = np.maximum.accumulate(np.concatenate([[-np.inf], value[order]]))[:-1]
+    return np.asarray(order[value[order] > best])
+
+
+def maps_picture(page: StudyPage, numbers: Sequence[int]) -> Figure:
+    """Where trials of some variants fail, each on a map of its own."""
+    columns = min(3, len(numbers))
+    lines = -(-len(numbers) // columns)
+    figure = Figure(figsize=(4.4 * columns, 3.8 * lines), dpi=100, layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axis, number in zip(axes, numbers, strict=False):
+        _draw_places(axis, page, number)
+    for axis in axes[len(numbers) :]:
+        axis.set_axis_off()
     return figure
 
 
@@ -111,23 +159,30 @@ def _draw_survival(
         axis.legend(fontsize=7, loc="lower left")
 
 
-def _draw_places(axis: Axes, page: StudyPage) -> None:
+def _draw_places(axis: Axes, page: StudyPage, number: int) -> None:
     """Errors by place, and where trials fail, of one variant."""
-    places = page.places
-    rmse = np.array([[np.nan if x is None else x for x in row] for row in places["rmse_m"]], float)
+    row = page.rows[number]
+    places = row["places"]
+    rmse = np.array([[np.nan if x is None else x for x in line] for line in places["rmse_m"]])
     failures = np.array(places["failures"])
     x, y = places["origin_m"]
     side = places["cell_m"]
     extent = (x, x + side * rmse.shape[0], y, y + side * rmse.shape[1])
-    image = axis.imshow(rmse.T, origin="lower", extent=extent, cmap="viridis", vmin=0.0)
-    axis.figure.colorbar(image, ax=axis, label="position RMSE there [m]", shrink=0.8)
-    lines = np.reshape(np.asarray(page.walls, float), (-1, 2, 2))
-    for (x0, y0), (x1, y1) in lines:
-        axis.plot([x0, x1], [y0, y1], color=GREY, linewidth=0.7)
+    if np.isfinite(rmse).any():
+        # Of a study with a few wild trials the rest is still seen.
+        top = float(np.nanquantile(rmse, 0.98)) or None
+        image = axis.imshow(
+            rmse.T, origin="lower", extent=extent, cmap="viridis", vmin=0.0, vmax=top
+        )
+        axis.figure.colorbar(image, ax=axis, label="position RMSE there [m]", shrink=0.8)
+    segments = np.reshape(np.asarray(page.walls[number], float), (-1, 2, 2))
+    axis.add_collection(LineCollection([*segments], colors=GREY, linewidths=0.7))
     i, j = np.nonzero(failures)
     if len(i):
         centre = x + side * (i + 0.5), y + side * (j + 0.5)
-        axis.scatter(*centre, s=12 + 12 * failures[i, j], color=RED, label="trials fail here")
+        size = 14 + 120 * failures[i, j] / failures.sum()
+        axis.scatter(*centre, s=size, color=RED, alpha=0.8, label="trials fail here")
         axis.legend(fontsize=8)
     axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    axis.set_title(_short(page.names[page.mapped]), fontsize=9)
+    axis.autoscale_view()
+    axis.set_title(_short(row["name"]), fontsize=9)

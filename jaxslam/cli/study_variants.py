@@ -58,11 +58,15 @@ def prepare(study: StudyFile) -> Prepared:
     given = [with_life(one.settings, study.path.parent) for one in study.variants]
     _check_used(study.path, given)
     slots = max(own.get("life.people", 0) for own in given)
+    # All of them draw the same random numbers then, and run the same program.
+    lives = any(key in LIFE for own in given for key in own)
     for (name, settings, cost), all_of_it in zip(study.variants, given, strict=True):
         with name_errors(f"{study.path}: {name}"):
             own = {key: settings[key] for key in study.varied if key in settings}
             files = files_of(all_of_it, study.path.parent)
-            variant = _variant(name, own, files, slots, study.seed, notes)._replace(cost=cost)
+            variant = _variant(
+                name, own, files, slots if lives else None, study.seed, notes
+            )._replace(cost=cost)
         mark = fingerprint(variant, study.seed)
         if mark in found:  # though their settings differ, as of a value that is the default
             raise same_variants(study.path, found[mark].name, name)
@@ -71,9 +75,14 @@ def prepare(study: StudyFile) -> Prepared:
 
 
 def _variant(
-    name: str, shown: Settings, given: Settings, slots: int, seed: int, notes: dict[str, None]
+    name: str,
+    shown: Settings,
+    given: Settings,
+    slots: int | None,
+    seed: int,
+    notes: dict[str, None],
 ) -> Variant:
-    """The variant with some settings; adds to the notes."""
+    """The variant with some settings; adds to the notes. Without slots nothing goes wrong."""
     place = tuple(given.get(key) for key in ("world", "path", "drive", "resolution", "unit"))
     building = _building(*place)
     robot, config = _robot(given, notes)
@@ -86,7 +95,7 @@ def _variant(
         )
     world, life = building.world, None
     wrong = {LIFE[key]: x for key, x in given.items() if key in LIFE}
-    if wrong or slots:  # else nothing of it is computed
+    if slots is not None:
         living = life_of(building, wrong, slots=slots, seed=seed)
         world, life = living.world, living.life
         notes |= dict.fromkeys([f"{name}: life: {living.note}"] if wrong else [])

@@ -21,7 +21,7 @@ def findings(numbers: Metrics) -> list[str]:
     found = [first, *_best(numbers), *_cheapest(numbers)]
     found += [_effect(one) for one in numbers["effects"]]
     compared = [row for row in rows if "against_first" in row]
-    if len(compared) <= MAX_COMPARED:
+    if not numbers["effects"] and len(compared) <= MAX_COMPARED:
         found += [_against(row, rows[0]) for row in compared]
     return [*found, *_places(rows), *_honesty(rows), *_broken(rows)]
 
@@ -66,7 +66,7 @@ def _best(numbers: Metrics) -> list[str]:
         if ends[0] == ends[-1]:
             return [f"All variants succeed equally often: in {_share(best)} of the trials."]
         return [
-            f"No variant succeeds significantly more often than another: "
+            f"No variant succeeds significantly less often than {_named(best)}: all "
             f"{_percent(ends[0])} to {_percent(ends[-1])} %."
         ]
     text = f"{_named(best)} succeeds most often: {_share(best)}."
@@ -98,7 +98,7 @@ def _cheapest(numbers: Metrics) -> list[str]:
 def _effect(one: Metrics) -> str:
     """What a value of a setting changes, over variants that are equal in all others."""
     own = one["success"]
-    change = f"{100.0 * own['mean']:+.1f} % {_interval(own)}"
+    change = f"{100.0 * own['mean']:+.1f} points {_interval(own)}"
     if not own["low"] <= 0.0 <= own["high"]:
         text = f"trials succeed {'more' if own['mean'] > 0 else 'less'} often, by {change}"
     else:
@@ -126,7 +126,8 @@ def _against(row: Metrics, first: Metrics) -> str:
     if success["adjusted_p_value"] < LEVEL:
         word = "less" if success["value"] > 0 else "more"
         text = f"{_named(row)} fails {word} often than {_named(first)}: {shares}"
-        text += f", difference [{_percent(-success['high'])}, {_percent(-success['low'])}] %"
+        text += f", a difference of [{_percent(-success['high'])}, "
+        text += f"{_percent(-success['low'])}] points"
     elif success["only_first"] or success["only_second"]:
         text = (
             f"Failures of {_named(row)} and {_named(first)} do not differ significantly: {shares}"

@@ -34,8 +34,10 @@ def report(
         success_distance: [m] a trial succeeds if its position is never further off.
     """
     outcomes = [one.record for one in found]
-    shares = [succeeded(own, success_distance).mean() for own in outcomes]
-    best = int(np.argmax(shares))
+    failures = [(~succeeded(own, success_distance)).sum() for own in outcomes]
+    # Of those that succeed as often, the one with the smallest errors.
+    errors = [float(np.median(position_rmse(own))) for own in outcomes]
+    best = min(range(len(outcomes)), key=lambda k: (failures[k], errors[k]))
     rows = []
     for number, (variant, own) in enumerate(zip(variants, outcomes, strict=True)):
         row: Metrics = {"name": variant.name, "settings": dict(variant.settings)}

@@ -13,7 +13,7 @@ from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY
 
 COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, BLACK, GREY)
 MAX_SHOWN = 40  # variants with a line of their own
-MAX_LETTERS = 34  # of a name
+MAX_LETTERS = 44  # of a name
 
 
 class StudyPage(NamedTuple):
@@ -94,8 +94,9 @@ def maps_picture(page: StudyPage, numbers: Sequence[int]) -> Figure:
     lines = -(-len(numbers) // columns)
     figure = Figure(figsize=(4.4 * columns, 3.8 * lines), dpi=100, layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    tops = [_top(page.rows[number]) for number in numbers]
     for axis, number in zip(axes, numbers, strict=False):
-        _draw_places(axis, page, number)
+        _draw_places(axis, page, number, max(tops))
     for axis in axes[len(numbers) :]:
         axis.set_axis_off()
     return figure
@@ -115,7 +116,7 @@ def _draw_success(axis: Axes, names: Sequence[str], summaries: Sequence[Metrics]
     spread = np.maximum([value - low, high - value], 0.0)
     axis.errorbar(value, rows, xerr=spread, fmt="o", color=BLUE, ecolor=GREY, capsize=2)
     axis.set(xlim=(-0.03, 1.03), xlabel="trials that succeed, with 95 % intervals")
-    axis.set_yticks(rows, names, fontsize=8)
+    axis.set_yticks(rows, names, fontsize=7)
     axis.invert_yaxis()
     axis.grid(axis="x", alpha=0.3)
 
@@ -144,23 +145,33 @@ def _numbers(found: Sequence[Any], key: str) -> np.ndarray:
 def _draw_survival(
     axis: Axes, names: Sequence[str], summaries: Sequence[Metrics], seconds: float
 ) -> None:
-    """Share of trials that have not failed by a time."""
+    """Share of trials that have not failed by a time; those that fail most have a colour."""
+    last = [([1.0] + one["time_to_failure_s"]["share_without_failure"])[-1] for one in summaries]
+    worst = np.argsort(last, kind="stable")[: len(COLOURS)].tolist()
     for number, (name, one) in enumerate(zip(names, summaries, strict=True)):
         found = one["time_to_failure_s"]
         times = np.concatenate([[0.0], found["times"], [seconds]])
         share = np.concatenate([[1.0], found["share_without_failure"]])
         share = np.append(share, share[-1])
-        colour = COLOURS[number % len(COLOURS)]
-        label = name if len(names) <= len(COLOURS) else None
-        axis.step(times, share, where="post", color=colour, label=label, linewidth=1.2)
+        shown = number in worst
+        colour = COLOURS[worst.index(number)] if shown else GREY
+        order, label = (3, name) if shown else (1, None)
+        axis.step(
+            *(times, share), where="post", color=colour, label=label, linewidth=1.2, zorder=order
+        )
     axis.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="trials that have not failed yet")
     axis.grid(alpha=0.3)
-    if len(names) <= len(COLOURS):
-        axis.legend(fontsize=7, loc="lower left")
+    axis.legend(fontsize=7, loc="lower left")
 
 
-def _draw_places(axis: Axes, page: StudyPage, number: int) -> None:
-    """Errors by place, and where trials fail, of one variant."""
+def _top(row: Metrics) -> float:
+    """An error [m] that is exceeded in few places, so that these do not hide the rest."""
+    found = [x for line in row["places"]["rmse_m"] for x in line if x is not None]
+    return float(np.quantile(found, 0.98)) if found else 0.0
+
+
+def _draw_places(axis: Axes, page: StudyPage, number: int, top: float | None = None) -> None:
+    """Errors by place, up to `top` [m], and where trials fail, of one variant."""
     row = page.rows[number]
     places = row["places"]
     rmse = np.array([[np.nan if x is None else x for x in line] for line in places["rmse_m"]])
@@ -169,12 +180,11 @@ def _draw_places(axis: Axes, page: StudyPage, number: int) -> None:
     side = places["cell_m"]
     extent = (x, x + side * rmse.shape[0], y, y + side * rmse.shape[1])
     if np.isfinite(rmse).any():
-        # Of a study with a few wild trials the rest is still seen.
-        top = float(np.nanquantile(rmse, 0.98)) or None
+        most = (_top(row) if top is None else top) or 1.0
         image = axis.imshow(
-            rmse.T, origin="lower", extent=extent, cmap="viridis", vmin=0.0, vmax=top
+            rmse.T, origin="lower", extent=extent, cmap="viridis", vmin=0.0, vmax=most
         )
-        axis.figure.colorbar(image, ax=axis, label="position RMSE there [m]", shrink=0.8)
+        axis.figure.colorbar(image, ax=axis, label="RMSE there [m]", shrink=0.8)
     segments = np.reshape(np.asarray(page.walls[number], float), (-1, 2, 2))
     axis.add_collection(LineCollection([*segments], colors=GREY, linewidths=0.7))
     i, j = np.nonzero(failures)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from functools import cache
 from io import StringIO
 from time import monotonic, sleep
 
@@ -37,19 +38,24 @@ CONFIG = Config.for_lidar(
     frontend=FrontendConfig(grid=GridSpec(x_max=4.0, y_half=3.0)),
     filter=FilterConfig(max_landmarks=16, max_updates=4, landmark_kinds=(CORNER, WALL)),
 )
-CASE = Variant(
-    "room",
-    {},
-    CONFIG,
-    NoiseParams.for_simulated_robot(),
-    Robot(),
-    worlds.named("fig07"),
-    densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
-    4,
-)
 SEED = 5
 NUM_TRIALS = 10
 TIMED = {"seconds", "seconds_per_scan", "peak_mb", "processes", "devices"}
+
+
+@cache
+def case():
+    """What is driven; not made at import, where processes that start may not use JAX yet."""
+    return Variant(
+        "room",
+        {},
+        CONFIG,
+        NoiseParams.for_simulated_robot(),
+        Robot(),
+        worlds.named("fig07"),
+        densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
+        4,
+    )
 
 
 def untimed(numbers):
@@ -61,7 +67,7 @@ def untimed(numbers):
 def done(tmp_path_factory):
     """The numbers of one process, and the folder where it has kept its runs."""
     folder = tmp_path_factory.mktemp("one") / "runs"
-    return monte_carlo.work(CASE, SEED, NUM_TRIALS, folder, StringIO()), folder
+    return monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO()), folder
 
 
 def hello(text, stream):
@@ -98,7 +104,7 @@ def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypa
     monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
     flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
     monkeypatch.setenv("XLA_FLAGS", flags)
-    numbers = monte_carlo.compute(CASE, SEED, NUM_TRIALS, tmp_path / "runs", processes.local(2))
+    numbers = monte_carlo.compute(case(), SEED, NUM_TRIALS, tmp_path / "runs", processes.local(2))
     assert numbers["processes"] == numbers["devices"] == 2
     assert untimed(numbers) == untimed(done[0])
     (one,), (two,) = ([*folder.glob("*.npz")] for folder in (done[1], tmp_path / "runs"))
@@ -218,19 +224,19 @@ def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_pat
 
     monkeypatch.setattr(kept_trials, "_keep", stopping)
     with pytest.raises(Stop):
-        monte_carlo.work(CASE, SEED, NUM_TRIALS, folder, StringIO())
+        monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO())
     monkeypatch.setattr(kept_trials, "_keep", real)
     (file,) = folder.iterdir()
     before = file.stat().st_mtime_ns
     (folder / ".123.tmp").write_bytes(b"half of")
-    numbers = monte_carlo.work(CASE, SEED, NUM_TRIALS, folder, StringIO())
+    numbers = monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO())
     assert untimed(numbers) == untimed(done[0]) and file.stat().st_mtime_ns == before
     assert [f.name for f in sorted(folder.glob("*.npz"))] == ["0000000.npz", "0000008.npz"]
 
 
 def test_trials_of_another_seed_are_not_mixed_in(done):
     with pytest.raises(InputError, match="has trials of another variant, seed"):
-        monte_carlo.work(CASE, SEED + 1, NUM_TRIALS, done[1])
+        monte_carlo.work(case(), SEED + 1, NUM_TRIALS, done[1])
 
 
 def kept(folder):
@@ -271,7 +277,7 @@ def test_trials_that_are_not_finite_are_masked_and_listed(done):
 
 def test_one_trial_is_replayed_alone(done):
     worst = done[0]["worst"][0]
-    alone = monte_carlo.replay(CASE, SEED, worst["run"])
+    alone = monte_carlo.replay(case(), SEED, worst["run"])
     assert alone["position_rmse_m"] == pytest.approx(worst["position_rmse_m"], rel=1e-12)
     np.testing.assert_array_equal(alone["worst"][0]["estimate"], worst["estimate"])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import main, study_variants
-from jaxslam.study import runner, study_file
+from jaxslam.study import kept_trials, runner, study_file
 
 SMALL = """
 trials = 5
@@ -34,7 +34,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_trials(monkeypatch):
     """Fail at once where a wrong study is taken to be right."""
-    monkeypatch.setattr(runner, "run", None)
+    monkeypatch.setattr(runner, "run_timed", None)
 
 
 def said_of(folder, text, capsys, *more):
@@ -113,30 +113,50 @@ def test_a_file_of_life_is_that_of_simulate(folder, capsys):
     assert "missing 0: life: people 3, missing 0" in found.notes
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--processes", "0"], "--processes: 0 is not between 1 and 256"),
+        (["--process-id", "1"], "--coordinator-address: is missing"),
+        (["--coordinator-address", "a:1", "--num-processes", "2"], "--process-id: is not below"),
+    ],
+)
+def test_processes_that_do_not_fit_are_one_line(folder, options, message, capsys):
+    assert message in said_of(folder, '[base]\npath = "p.csv"\n', capsys, *options)
+
+
 @pytest.mark.slow
-def test_a_study_runs_resumes_and_writes_its_table(folder, capsys, monkeypatch):
+@pytest.mark.timeout(900)
+def test_a_study_runs_resumes_and_writes_its_page(folder, capsys, monkeypatch):
     (folder / "s.toml").write_text(SMALL)
     call = ["study", "s.toml", "--out", "o"]
     assert main.main([*call, "--dry-run"]) == 0
     said = capsys.readouterr().out
-    assert "2 variants of 5 trials" in said and "minutes on" in said
+    assert "2 variants of 5 trials" in said and "minutes on" in said and "MB of memory" in said
     assert not (folder / "o").exists()
-    whole = runner._run_variant
+    whole = kept_trials.collect
+    done = []
 
-    def stops(number, *more):
-        if number == 1:
+    def stops(*arguments, **more):
+        if done:
             raise KeyboardInterrupt("interrupted; the same command resumes")
-        return whole(number, *more)
+        done.append(whole(*arguments, **more))
+        return done[0]
 
-    monkeypatch.setattr(runner, "_run_variant", stops)
+    monkeypatch.setattr(kept_trials, "collect", stops)
     assert main.main(call) == 130
     assert list((folder / "o").glob("study_parts/000/*.npz"))
-    monkeypatch.setattr(runner, "_run_variant", whole)
+    monkeypatch.setattr(kept_trials, "collect", whole)
     assert main.main(call) == 0
-    assert sorted(x.name for x in (folder / "o").iterdir()) == ["study.json", "study.png"]
+    names = ["report.html", "study.json", "study.png", "trials.csv"]
+    assert sorted(x.name for x in (folder / "o").iterdir()) == names
     found = json.loads((folder / "o" / "study.json").read_text())
     assert [row["name"] for row in found["variants"]] == ["as it is", "people"]
     assert found["variants"][1]["settings"] == {"life.people": 4}
     assert all(row["success"]["value"] == 1.0 for row in found["variants"])
     assert found["variants"][1]["against_first"]["success"]["pairs"] == 5
-    assert "as it is" in capsys.readouterr().out
+    assert len((folder / "o" / "trials.csv").read_text().splitlines()) == 11
+    said = capsys.readouterr().out
+    assert "as it is" in said and "- All variants succeed equally often" in said
+    page = (folder / "o" / "report.html").read_text()
+    assert "All variants succeed equally often" in page and "people: life: people 4" in page

@@ -28,11 +28,10 @@ from jaxslam.simulation.life import life_in
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.traffic import Traffic
 from jaxslam.simulation.worlds import World
-from jaxslam.study import report as report_module
-from jaxslam.study import runner
-from jaxslam.study.findings import findings
+from jaxslam.study import reporting, runner
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.runner import Progress, Variant
+from jaxslam.study.wording import findings
 
 NAME = "study"
 SCANNERS = ("LDS-01", "RPLidar A1", "UTM-30LX")
@@ -109,7 +108,7 @@ def numbers_of(
     variants: list[Variant], found: list[Collected], seed: int, success: float
 ) -> common.Numbers:
     """The report, its findings, and walls and path of each building."""
-    numbers = report_module.report(variants, found, seed=seed, success_distance=success)
+    numbers = reporting.report(variants, found, seed=seed, success_distance=success)
     worlds = {
         one.settings["building"]: {"walls": np.asarray(one.world.walls), "path": one.path[::10]}
         for one in variants

@@ -21,12 +21,11 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.output import folder, write_json, write_text
 from jaxslam.pipeline.episodes import EPISODE_BATCH
 from jaxslam.study import processes as processes_module
-from jaxslam.study import report as report_module
-from jaxslam.study import runner, study_file
-from jaxslam.study.findings import findings
+from jaxslam.study import reporting, runner, study_file
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.processes import Group, LostProcessError
 from jaxslam.study.runner import Progress, Variant
+from jaxslam.study.wording import findings
 
 PARTS = "study_parts"  # folder of finished trials
 BYTES_PER_SCAN = 12  # that are kept of a trial
@@ -87,13 +86,13 @@ def study(
     if found is None:
         print("done; process 0 has the results")
         return
-    numbers = report_module.report(
+    numbers = reporting.report(
         prepared.variants, found, seed=asked.seed, success_distance=asked.success_distance
     )
     said = findings(numbers)
     with folder(out) as out_dir:
         write_json(out_dir / "study.json", numbers | {"findings": said})
-        table = report_module.table_of_trials(
+        table = reporting.table_of_trials(
             prepared.variants, found, success_distance=asked.success_distance
         )
         write_text(out_dir / "trials.csv", table)

@@ -44,7 +44,7 @@ slip = 0.01
 PARTS: Mapping[str, Any] = MappingProxyType(
     {"ranges": RangeErrors, "traffic": Traffic, "wheels": WheelFaults, "furniture": Moves}
 )
-"""Records whose fields are the keys."""
+"""The records whose fields are the keys."""
 
 SETTINGS: Mapping[str, str] = MappingProxyType(
     {field: part for part, record in PARTS.items() for field in record._fields}

@@ -10,11 +10,11 @@ import pytest
 from jaxslam.evaluation.trial_statistics import holm
 from jaxslam.io.output import plain
 from jaxslam.simulation import Robot
-from jaxslam.study.findings import findings
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.outcomes import Outcomes
-from jaxslam.study.report import effects, report, table_of_trials
+from jaxslam.study.reporting import effects, report, table_of_trials
 from jaxslam.study.runner import Variant
+from jaxslam.study.wording import findings
 
 N, T = 200, 8
 

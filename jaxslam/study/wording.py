@@ -10,7 +10,7 @@ OVER_CONFIDENT, CAUTIOUS = 1.5, 0.67  # NEES per degree of freedom beyond which 
 
 
 def findings(numbers: Metrics) -> list[str]:
-    """Sentences on the numbers of `report`, the most important first."""
+    """Sentences on the numbers of `reporting.report`, the most important first."""
     rows = numbers["variants"]
     first = (
         f"{len(rows)} variants of {numbers['trials']} trials. A trial succeeds if its position is "

@@ -65,7 +65,7 @@ def study(
     check_range("--processes", processes, 1, 256)
     given = processes, coordinator_address, num_processes, process_id
     group = processes_module.group_of(*given, names=FLAGS)
-    if group is None:
+    if group is None or dry_run:
         use_cpu_devices()
     asked = study_file.read(study_toml)
     prepared = prepare(asked)
@@ -80,7 +80,7 @@ def study(
     enable_caches()
     about = prepared.variants, asked.num_trials, asked.seed
     if dry_run:
-        _print_costs(*about, scans)
+        _print_costs(prepared.variants, asked.seed, scans)
         return
     found = _run(*about, out / PARTS, group)
     if found is None:
@@ -151,26 +151,25 @@ def _share(
     return peak_memory()
 
 
-def _print_costs(variants: Sequence[Variant], num_trials: int, seed: int, scans: int) -> None:
+def _print_costs(variants: Sequence[Variant], seed: int, scans: int) -> None:
     """Time and memory of a study, measured on a few trials of its first variant."""
     first, before = variants[0], memory_now()
     count = EPISODE_BATCH * jax.device_count()
-    taken = []
-    for own_seed in (seed, seed + 1):  # compiles at the first
-        begin = perf_counter()
-        runner.run([first], num_trials=count, seed=own_seed)
-        taken.append(perf_counter() - begin)
+    begin = perf_counter()
+    (probe,) = runner.run_timed([first], num_trials=count, seed=seed)
+    # The first trials are computed twice, once to compile.
+    compiling = max(perf_counter() - begin - 2 * probe.seconds, 0.0)
     release_memory()
-    numbers = len({runner.program_of(one) for one in variants})
-    compiling, per_scan = max(taken[0] - 2 * taken[1], 0.0), taken[1] / (count * first.num_scans)
-    per_scan /= 2.0  # trials are computed once more to compile, where nothing is kept
+    programs = len({runner.program_of(one) for one in variants})
+    per_scan = probe.seconds / (count * first.num_scans)
+    expected = per_scan * scans + programs * compiling
     kept = BYTES_PER_SCAN * scans / 2**20
-    more = (numbers - 1) * max(memory_now() - before, 0.0)
-    expected = per_scan * scans + numbers * compiling
+    most = peak_memory() + (programs - 1) * max(memory_now() - before, 0.0)
+    most += kept * (1 + 1 / len(variants))
     print(
         f"about {expected / 60:.1f} minutes on {jax.device_count()} devices: {per_scan * 1e3:.2f} "
-        f"ms a scan, and {compiling:.0f} s to compile each of {numbers} programs, or less where "
-        f"they are kept; about {peak_memory() + more + 2 * kept:.0f} MB of memory, "
+        f"ms a scan, and {compiling:.0f} s to compile each of {programs} programs, or less where "
+        f"they are kept; about {most:.0f} MB of memory, "
         f"{kept:.0f} MB of it outcomes; measured on {count} trials of {first.name!r}"
     )
 

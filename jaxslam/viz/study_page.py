@@ -14,6 +14,7 @@ from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY
 COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, BLACK, GREY)
 MAX_SHOWN = 40  # variants with a line of their own
 MAX_LETTERS = 44  # of a name
+SURROUNDINGS = 6  # squares around the drive that are shown
 
 
 class StudyPage(NamedTuple):
@@ -147,7 +148,7 @@ def _draw_survival(
 ) -> None:
     """Share of trials that have not failed by a time; those that fail most have a colour."""
     last = [([1.0] + one["time_to_failure_s"]["share_without_failure"])[-1] for one in summaries]
-    worst = np.argsort(last, kind="stable")[: len(COLOURS)].tolist()
+    worst = [k for k in np.argsort(last, kind="stable").tolist() if last[k] < 1.0][: len(COLOURS)]
     for number, (name, one) in enumerate(zip(names, summaries, strict=True)):
         found = one["time_to_failure_s"]
         times = np.concatenate([[0.0], found["times"], [seconds]])
@@ -161,7 +162,8 @@ def _draw_survival(
         )
     axis.set(ylim=(-0.03, 1.03), xlabel="time [s]", ylabel="trials that have not failed yet")
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=7, loc="lower left")
+    if worst:
+        axis.legend(fontsize=7, loc="lower left")
 
 
 def _top(row: Metrics) -> float:
@@ -190,9 +192,11 @@ def _draw_places(axis: Axes, page: StudyPage, number: int, top: float | None = N
     i, j = np.nonzero(failures)
     if len(i):
         centre = x + side * (i + 0.5), y + side * (j + 0.5)
-        size = 14 + 120 * failures[i, j] / failures.sum()
-        axis.scatter(*centre, s=size, color=RED, alpha=0.8, label="trials fail here")
+        size = 3 + 160 * failures[i, j] / failures.sum()
+        axis.scatter(*centre, s=size, color=RED, alpha=0.9, label="trials fail here")
         axis.legend(fontsize=8)
-    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    axis.autoscale_view()
+    margin = side * SURROUNDINGS
+    low, high = np.array(extent[::2]) - margin, np.array(extent[1::2]) + margin
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
     axis.set_title(_short(row["name"]), fontsize=9)

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -26,7 +27,6 @@ from jaxslam.pipeline.config import Config
 from jaxslam.simulation import drives, kinematics, named_worlds, scanner_presets
 from jaxslam.simulation.life import life_in
 from jaxslam.simulation.robot import Robot
-from jaxslam.simulation.traffic import Traffic
 from jaxslam.simulation.worlds import World
 from jaxslam.study import reporting, runner
 from jaxslam.study.kept_trials import Collected
@@ -74,14 +74,16 @@ def variants_of(maps: Path | None, intel: Path | None, metres: float) -> list[Va
     for name in BUILDINGS:
         world, path = building_of(name, maps, intel)
         path = first_part(path, metres)
+        living = life_in(world, path, max_people=max(PEOPLE))
         for scanner_name in SCANNERS:
             scanner = scanner_presets.preset(scanner_name)
             robot = Robot(scanner=scanner, scan_period=SCAN_PERIOD)
             fixed = Config.for_lidar(scanner.lidar()), kinematics.noise_params(robot), robot
             scans = drives.num_scans_of_drive(robot, path)
             for people in PEOPLE:
-                traffic = Traffic(people=float(people))
-                life = life_in(world, path, traffic=traffic, max_people=max(PEOPLE))
+                life = living._replace(
+                    traffic=living.traffic._replace(people=jnp.array(people, float))
+                )
                 settings = {"building": name, "scanner": scanner_name, "people": people}
                 title = f"{name}, {scanner_name}, {people} people"
                 found.append(Variant(title, settings, *fixed, world, path, scans, life))

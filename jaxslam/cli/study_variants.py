@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli.life_options import leaving, leaving_note, life_of
+from jaxslam.cli.life_options import LivingWorld, leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import name_errors
 from jaxslam.cli.world_options import Building, read_building
@@ -96,7 +96,7 @@ def _variant(
     world, life = building.world, None
     wrong = {LIFE[key]: x for key, x in given.items() if key in LIFE}
     if slots is not None:
-        living = life_of(building, wrong, slots=slots, seed=seed)
+        living = _living(place, tuple(wrong.items()), slots, seed)
         world, life = living.world, living.life
         notes |= dict.fromkeys([f"{name}: life: {living.note}"] if wrong else [])
     lidar, path = config.frontend.lidar, np.asarray(building.path)
@@ -134,6 +134,13 @@ def _building(
 @lru_cache(maxsize=256)
 def _num_scans(robot: Robot, path: bytes, dtype: str) -> int:
     return drives.num_scans_of_drive(robot, np.frombuffer(path, dtype).reshape(-1, 2))
+
+
+@lru_cache(maxsize=64)
+def _living(
+    place: tuple, wrong: tuple[tuple[str, float], ...], slots: int, seed: int
+) -> LivingWorld:
+    return life_of(_building(*place), dict(wrong), slots=slots, seed=seed)
 
 
 @lru_cache(maxsize=256)

@@ -33,7 +33,7 @@ class Variant(NamedTuple):
         world: Its building.
         path: (N, 2) [m, world] that it drives.
         num_scans: T, scans of a trial.
-        life: What may go wrong; None: nothing.
+        life: What may go wrong; None: nothing, and ranges have other numbers than with a life.
         cost: In any currency; None: not known.
     """
 

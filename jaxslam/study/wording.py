@@ -1,5 +1,6 @@
 """What a study has found, in words; what is not significant is said so."""
 
+import math
 from typing import Any
 
 from jaxslam.core.types import Metrics
@@ -99,18 +100,23 @@ def _effect(one: Metrics) -> str:
     """What a value of a setting changes, over variants that are equal in all others."""
     own = one["success"]
     change = f"{100.0 * own['mean']:+.1f} points {_interval(own)}"
-    if not own["low"] <= 0.0 <= own["high"]:
+    if _excludes(own["low"], own["high"], 0.0):
         text = f"trials succeed {'more' if own['mean'] > 0 else 'less'} often, by {change}"
     else:
         text = f"the difference in success is not significant, {change}"
     low, high = one["position_rmse_ratio_interval"]
-    if low is not None and not low <= 1.0 <= high:
+    if _excludes(low, high, 1.0):
         text += f"; errors are {one['position_rmse_ratio']:.2f} times as large [{low:.2f}, "
         text += f"{high:.2f}]"
     return (
         f"{one['setting']} {_value(one['value'])} instead of {_value(one['reference'])}, over "
         f"{one['pairs_of_variants']} pairs of variants: {text}."
     )
+
+
+def _excludes(low: float, high: float, value: float) -> bool:
+    """Whether an interval, if there is one, lies on one side of a value."""
+    return low > value or high < value
 
 
 def _value(value: Any) -> str:
@@ -135,7 +141,7 @@ def _against(row: Metrics, first: Metrics) -> str:
     else:
         text = f"{_named(row)} fails in the same trials as {_named(first)}: {_failure(row)}"
     ratio, (low, high) = own["position_rmse_ratio"], own["position_rmse_ratio_interval"]
-    if low is None or high is None or low != low:
+    if not math.isfinite(high - low):
         return text + "."
     if own["position_rmse_adjusted_p_value"] < LEVEL:
         return f"{text}; its errors are {ratio:.2f} times as large [{low:.2f}, {high:.2f}]."

@@ -102,6 +102,18 @@ def test_effects_are_those_over_pairs_that_differ_in_one_setting_alone():
     assert effects(variants[:2], found[:2], success_distance=0.5) == []
 
 
+def test_one_trial_says_nothing_about_differences():
+    first, second = (Outcomes(*(x[:1] for x in outcomes(k))) for k in (0, 1))
+    variants = [variant("a0", s="a", p=0), variant("a5", s="a", p=5)]
+    variants += [variant("b0", s="b", p=0), variant("b5", s="b", p=5)]
+    said = findings(reported(variants, [first, second, second, first]))
+    assert sum("the difference in success is not significant" in text for text in said) == 2
+    assert not any("more often" in text or "less often, by" in text for text in said)
+    said = findings(reported(variants[:2], [first, second]))
+    assert 'Failures of "a5" and "a0" do not differ significantly' in said[2]
+    json.dumps(plain(reported(variants, [first] * 4)), allow_nan=False)
+
+
 def test_every_trial_is_a_line_of_the_table():
     found = [Collected(outcomes(3), 1.0, 1.0), Collected(outcomes(0), 1.0, 1.0)]
     text = table_of_trials([variant("A"), variant("B")], found, success_distance=0.5)

@@ -189,7 +189,7 @@ def _draw_map(axis: Any, rows: list, world: common.Numbers) -> None:
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code, 2 for bad input, 130 for Ctrl-C."""
-    args = common.parse(__doc__, argv, maps="", intel="", runs=40, metres=25.0, success=0.25)
+    args = common.parse(__doc__, argv, maps="", intel="", runs=40, metres=20.0, success=0.25)
     if args.runs < 1:
         raise InputError("is not positive", field="--runs")
     use_cpu_devices()

@@ -7,6 +7,7 @@ from jaxslam.core.types import Metrics
 
 LEVEL = 0.05  # of significance, adjusted to the number of comparisons
 MAX_COMPARED = 12  # variants that are compared with the first in words
+MAX_NAMED = 6  # of a list of variants
 OVER_CONFIDENT, CAUTIOUS = 1.5, 0.67  # NEES per degree of freedom beyond which a filter is named
 
 
@@ -73,8 +74,8 @@ def _best(numbers: Metrics) -> list[str]:
     text = f"{_named(best)} succeeds most often: {_share(best)}."
     if not alike:
         return [f"{text} All others succeed significantly less often."]
-    shown = ", ".join(_named(row) for row in alike[:MAX_COMPARED])
-    more = f" and {len(alike) - MAX_COMPARED} more" if len(alike) > MAX_COMPARED else ""
+    shown = ", ".join(_named(row) for row in alike[:MAX_NAMED])
+    more = f" and {len(alike) - MAX_NAMED} more" if len(alike) > MAX_NAMED else ""
     less = len(rows) - 1 - len(alike)
     return [
         f"{text} Not significantly less often: {shown}{more}. "
@@ -178,8 +179,8 @@ def _honesty(rows: list[Metrics]) -> list[str]:
             if low > OVER_CONFIDENT if verb == "below" else high < CAUTIOUS:
                 own.append(f"{_named(row)} (NEES {nees['mean']:.2g})")
         if own:
-            more = f" and {len(own) - MAX_COMPARED} more" if len(own) > MAX_COMPARED else ""
-            shown = ", ".join(own[:MAX_COMPARED])
+            more = f" and {len(own) - MAX_NAMED} more" if len(own) > MAX_NAMED else ""
+            shown = ", ".join(own[:MAX_NAMED])
             found.append(f"The filter is {word}, NEES 1 being honest, of {shown}{more}.")
     return found
 

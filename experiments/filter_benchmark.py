@@ -33,6 +33,7 @@ from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.memory import peak_memory
 from jaxslam.core.types import Array
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import init
@@ -156,17 +157,6 @@ def latency(seed: int, num_trials: int) -> tuple[Numbers, Episode]:
         "front_end_ms": 1e3 * statistics.median(frontend_seconds),
         "step_landmarks": int(np.count_nonzero(belief.num_seen)),
     }, episodes
-
-
-def peak_memory() -> float:
-    """Most memory [MB] that this process has held; `resource` counts its parent's too."""
-    status = Path("/proc/self/status")
-    if status.is_file():
-        return int(re.search(r"VmHWM:\s+(\d+)", status.read_text())[1]) / 1024
-    import resource
-
-    unit = 2**20 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def memory(seed: int, num_trials: int) -> Numbers:

@@ -11,165 +11,98 @@ each with `--coordinator_address HOST:PORT --num_processes N --process_id K`. Th
 same bit for bit.
 """
 
-import ctypes
-import hashlib
-import os
 import shutil
 import sys
-import zipfile
-from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from time import perf_counter
-from typing import NamedTuple, TextIO
+from typing import TextIO
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 from tqdm import tqdm
 
-from experiments import common, processes, scaling
-from experiments.filter_benchmark import peak_memory
+from experiments import common, scaling
 from experiments.monte_carlo_picture import SHOWN, draw
-from jaxslam.core import trace_cache
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.types import Key
 from jaxslam.evaluation import consistency
 from jaxslam.evaluation.summary import evaluate
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io.errors import InputError
-from jaxslam.io.output import replace
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
 from jaxslam.simulation import drives, path_following, trials, worlds
 from jaxslam.simulation.robot import Robot
-from jaxslam.simulation.worlds import World
+from jaxslam.study import kept_trials, processes, runner
+from jaxslam.study.runner import Variant
 
 NAME = "monte_carlo"
-TRIALS_PER_FILE = 64
+GROUP_FLAGS = "--coordinator_address", "--num_processes", "--process_id"
 WORST = 5  # trials drawn one by one
 BINS = 60
 
 
-class Case(NamedTuple):
-    """Robot, world, path and configuration of all trials.
-
-    Attributes:
-        seed: Of the noise.
-        config: Of front end and filter.
-        robot: The robot.
-        walls: (S, 4) [m] of the world.
-        path: (N, 2) [m] to drive along.
-        num_scans: Of a trial; by default those to the end of the path.
-    """
-
-    seed: int
-    config: Config
-    robot: Robot
-    walls: np.ndarray
-    path: np.ndarray
-    num_scans: int | None = None
-
-
-def office(seed: int) -> Case:
+def office(num_scans: int | None = None) -> Variant:
     """The drive from S to F."""
+    robot = Robot()
     path = path_following.densify(worlds.waypoints("office"))
-    return Case(seed, Config(), Robot(), np.asarray(worlds.named("office").walls), path)
-
-
-class Trials:
-    """The trials of a case on all devices, in order from any number on."""
-
-    def __init__(self, case: Case):
-        """Prepare key, world, path and noise parameters."""
-        self.key = jax.random.key(case.seed)
-        self.params = NoiseParams.for_simulated_robot(*case.robot[:2])
-        self._case = case
-        self._world = World(jnp.asarray(case.walls, float))
-        self._path = jnp.asarray(case.path, float)
-        self.num_scans = case.num_scans or drives.num_scans_of_drive(case.robot, self._path)
-
-    def run(self, num_trials: int, first: int) -> Iterator[TrialResult]:
-        """Results of trials `first` to `num_trials` - 1, some at a time."""
-        return trials.run_trials(
-            self.key,
-            self._case.config,
-            self.params,
-            self._case.robot,
-            self._world,
-            self._path,
-            num_trials=num_trials,
-            num_scans=self.num_scans,
-            first=first,
-        )
+    return Variant(
+        "office",
+        {},
+        Config(),
+        NoiseParams.for_simulated_robot(*robot[:2]),
+        robot,
+        worlds.named("office"),
+        path,
+        num_scans or drives.num_scans_of_drive(robot, path),
+    )
 
 
 def work(
-    case: Case, num_trials: int, folder: Path | None, stream: TextIO | None = None
+    case: Variant, seed: int, num_trials: int, folder: Path | None, stream: TextIO | None = None
 ) -> common.Numbers:
     """Errors of B trials; called in all processes, of which process 0 keeps the results.
 
     Args:
         case: What is driven.
+        seed: Of the noise.
         num_trials: B.
         folder: For finished trials, so that a next call resumes; None to keep nothing.
         stream: Of the progress bar.
     """
-    own = Trials(case)
-    leads = jax.process_index() == 0
-    folder = folder if leads else None
-    mark = fingerprint(case._replace(num_scans=own.num_scans), own.params)
-    done, seconds, peak = load(folder, mark)
-    first = sum(len(part.finite) for part in done)
-    if jax.process_count() > 1:
-        first = int(multihost_utils.broadcast_one_to_all(np.int32(first)))
-    with tqdm(
-        total=num_trials,
-        initial=min(first, num_trials),
-        unit="trial",
-        file=stream,
-        desc="compiling",
-    ) as bar:
-        if first < num_trials:  # compiles, which is not timed
-            next(own.run(first + 1, first))
-            release_memory()
-        bar.set_description("running")
-        bar.unpause()
-        begin, new = perf_counter(), []
-        for part in own.run(num_trials, first):
-            bar.update(len(part.finite))
-            first += len(part.finite)
-            if not leads:
-                continue
-            new.append(part)
-            if sum(len(one.finite) for one in new) >= TRIALS_PER_FILE or first == num_trials:
-                done.append(episodes.concatenate_results(new))
-                now, new = perf_counter(), []
-                seconds, begin = seconds + now - begin, now
-                peak = max(peak, peak_memory())
-                keep(folder, first, done[-1], mark, seconds, peak)
-    if not leads:
-        return {"peak_mb": peak_memory()}
-    results = jax.tree.map(lambda x: x[:num_trials], episodes.concatenate_results(done))
-    numbers = {
-        "seed": case.seed,
-        "steps": own.num_scans,
+    with tqdm(total=num_trials, unit="trial", file=stream, desc="compiling") as bar:
+
+        def show(done: int) -> None:
+            if not bar.n:  # what earlier calls have done took no time
+                bar.initial = bar.n = bar.last_print_n = done
+                bar.unpause()
+            bar.set_description("running" if done > bar.initial else "compiling", refresh=False)
+            bar.update(done - bar.n)
+
+        results, seconds, peak = kept_trials.collect(
+            partial(runner.results_of, case, seed),
+            TrialResult,
+            num_trials,
+            folder=folder,
+            mark=runner.fingerprint(case, seed),
+            callback=show,
+        )
+    if results is None:
+        return {"peak_mb": peak}
+    return {
+        "seed": seed,
+        "steps": case.num_scans,
         "seconds": seconds,
         "seconds_per_scan": seconds / results.num_updates.size,
         "devices": jax.device_count(),
         "processes": jax.process_count(),
-        **summary(own.key, results),
+        **summary(jax.random.key(seed), results),
+        "walls": np.asarray(case.world.walls),
+        "peak_mb": peak,
     }
-    return numbers | {"walls": case.walls, "peak_mb": max(peak, peak_memory())}
-
-
-def release_memory() -> None:
-    """Return memory freed by the compiler to the system: two gigabytes that malloc would keep."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:  # glibc has it
-        trim(0)
 
 
 def summary(key: Key, results: TrialResult) -> common.Numbers:
@@ -213,84 +146,20 @@ def key_data(key: Key, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
     return np.asarray(jax.random.key_data(keys))
 
 
-def fingerprint(case: Case, params: NoiseParams) -> str:
-    """Text that is the same for trials of one experiment: it depends on case and program."""
-    text = hashlib.sha256(repr((case._replace(walls=0, path=0), trace_cache.version())).encode())
-    for x in (case.walls, case.path, *jax.tree.leaves(params)):
-        text.update(np.asarray(x, float).tobytes())
-    return f"{case.seed}, {text.hexdigest()[:16]}"
-
-
-def keep(
-    folder: Path | None, end: int, part: TrialResult, mark: str, seconds: float, peak: float
-) -> None:
-    """Write the trials before number `end` to a file, which appears whole or not at all."""
-    if folder is None:
-        return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", path=folder) from None
-    with replace(folder / f"{end - len(part.finite):07d}.npz") as file:
-        np.savez(file, mark=mark, seconds=seconds, peak_mb=peak, **part._asdict())
-
-
-def load(folder: Path | None, mark: str) -> tuple[list[TrialResult], float, float]:
-    """Kept trials, from number 0 without a gap; their seconds and peak memory [MB]."""
-    parts, seconds, peak = [], 0.0, 0.0
-    for first, file in _files(folder):
-        if first != sum(len(part.finite) for part in parts):
-            break
-        try:
-            with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as saved:
-                other = str(saved["mark"])
-                part = TrialResult(*(saved[name] for name in TrialResult._fields))
-                seconds, peak = float(saved["seconds"]), float(saved["peak_mb"])
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
-            raise InputError("is broken", path=file, advice="remove it") from None
-        if other != mark:
-            advice = f"finish those, or remove {folder}"
-            raise InputError("has trials of another seed or program", path=file, advice=advice)
-        parts.append(part)
-    return parts, seconds, peak
-
-
-def _files(folder: Path | None) -> Iterator[tuple[int, Path]]:
-    """Number of the first trial and path of each file, in order."""
-    for file in sorted([] if folder is None else folder.glob("*.npz")):
-        yield int(file.stem), file
-
-
-def replay(case: Case, number: int) -> common.Numbers:
+def replay(case: Variant, seed: int, number: int) -> common.Numbers:
     """Drive one trial of the experiment alone; its errors."""
-    own = Trials(case)
-    alone = episodes.concatenate_results(own.run(number + 1, number))
-    return {"run": number} | summary(own.key, alone)
-
-
-def group_of(args: Namespace) -> processes.Group | None:
-    """The processes that the arguments ask for; None for this one alone.
-
-    Raises:
-        InputError: They do not fit together.
-    """
-    if not args.coordinator_address:
-        if args.num_processes or args.process_id >= 0:
-            raise InputError("is missing", field="--coordinator_address")
-        return processes.local(args.processes) if args.processes > 1 else None
-    if not 0 <= args.process_id < args.num_processes:
-        raise InputError("is not below --num_processes", field="--process_id")
-    return processes.Group(args.coordinator_address, args.num_processes, (args.process_id,))
+    alone = episodes.concatenate_results(runner.results_of(case, seed, number + 1, number))
+    return {"run": number} | summary(jax.random.key(seed), alone)
 
 
 def compute(
-    case: Case, num_trials: int, folder: Path, group: processes.Group | None = None
+    case: Variant, seed: int, num_trials: int, folder: Path, group: processes.Group | None = None
 ) -> common.Numbers | None:
     """Errors of B trials on all devices of a group of processes; None where process 0 is not."""
     if group is None:
         use_cpu_devices()
-        return work(case, num_trials, folder, sys.stderr)
-    results = processes.run_group(group, work, case, num_trials, folder)
+        return work(case, seed, num_trials, folder, sys.stderr)
+    results = processes.run_group(group, work, runner.in_numpy(case), seed, num_trials, folder)
     if 0 not in group.own:
         return None
     # The memory of all processes of this machine counts.
@@ -313,13 +182,15 @@ def main(argv: list[str] | None = None) -> int:
     folder = args.out / f"{NAME}_runs"
     if args.runs < 1:
         raise InputError("is not positive", field="--runs")
-    case = office(args.seed)
+    given = args.processes, args.coordinator_address, args.num_processes, args.process_id
+    group = processes.group_of(*given, names=GROUP_FLAGS)
+    case = office()
     if args.replay >= 0:
-        found = replay(case, args.replay)
+        found = replay(case, args.seed, args.replay)
         print(f"trial {found['run']}:", end=" ")
         print({key: found[key] for key in ("position_rmse_m", "diverged", "nonfinite")})
         return 0
-    numbers = compute(case, args.runs, folder, group_of(args))
+    numbers = compute(case, args.seed, args.runs, folder, group)
     if numbers is None:
         print("done; process 0 has the results")
         return 0

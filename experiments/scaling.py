@@ -12,7 +12,8 @@ import jax
 
 from experiments import common, timing
 from experiments.common import Numbers
-from experiments.filter_benchmark import peak_memory, run_named_task, run_task
+from experiments.filter_benchmark import run_named_task, run_task
+from jaxslam.core.memory import peak_memory
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config

@@ -10,6 +10,7 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
+from jaxslam.cli.life_options import leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import OptionalFile, OptionalLength, OutFolder, check_range, name_errors
 from jaxslam.cli.stopwatch import stopwatch
@@ -19,7 +20,7 @@ from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.types import JUNCTION
 from jaxslam.evaluation import log_errors, summary
 from jaxslam.frontend.config import FrontendConfig
-from jaxslam.io import robot_file, tum
+from jaxslam.io import life_file, robot_file, tum
 from jaxslam.io.output import folder
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
@@ -51,6 +52,7 @@ def simulate(
     seed: int = 0,
     noise: OptionalFile = None,
     robot: OptionalFile = None,
+    life: OptionalFile = None,
     landmarks: Literal["all", "junctions"] = "all",
     labels: Literal["segments", "codes"] = "segments",
     out: OutFolder = Path("out"),
@@ -80,6 +82,9 @@ def simulate(
             simulated robot.
         robot: File of the robot, TOML or JSON: scanner, drive, noise, limits, mount; by default it
             has two wheels 0.4 m apart and 361 beams ahead. `jaxslam.io.robot_file` documents it.
+        life: File of what goes wrong, TOML or JSON: people, doors, furniture, glass, missing beams,
+            slip, lost odometry and scans; by default ranges have their noise and nothing else does.
+            `jaxslam.io.life_file` documents it.
         landmarks: Landmark types: all, or only the junctions of the Voronoi diagram (the paper's
             nodes).
         labels: Labels of occupied cells in the Voronoi expansion: straight wall segments, or the
@@ -89,6 +94,7 @@ def simulate(
     use_cpu_devices()
     check_range("--trials", trials, 1, 10**6)
     check_range("--seed", seed, 0, 2**32 - 1)
+    goes_wrong = None if life is None else life_file.read(life)
     building = read_building(
         world, path, drive=drive, resolution=resolution, unit=unit, layers=layers
     )
@@ -103,6 +109,14 @@ def simulate(
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     simulated, config = _robot(robot, config)
     params = read_params(noise, kinematics.noise_params(simulated))
+    given = None
+    if goes_wrong is not None:
+        with name_errors(str(life)):
+            walls, given, note = life_of(building, goes_wrong, seed=seed)
+        print(f"life: {note}", flush=True)
+    lidar = config.frontend.lidar
+    open_share = leaving(lidar, walls, simulated, points)
+    print(leaving_note(open_share, lidar.range_max), flush=True)
     key = jax.random.key(seed)
     with folder(out) as out_dir:
         enable_caches()
@@ -118,16 +132,19 @@ def simulate(
                 points,
                 num_trials=trials,
                 num_scans=num_scans,
+                life=given,
             )
             results = _collect(groups, trials)
         lengths = [log_errors.path_length(poses) for poses in np.asarray(results.truth)]
         numbers = summary.evaluate(results) | {
             "ate_rmse_m": log_errors.mean_ate(results),
             "path_length_m": float(np.mean(lengths)),
+            "beams_leaving": open_share._asdict(),
             "seconds": seconds,
         }
+        about = key, config, params, simulated, walls, points
         true_poses, result = trials_module.replay_trial(
-            key, config, params, simulated, walls, points, trial=0, num_scans=num_scans
+            *about, trial=0, num_scans=num_scans, life=given
         )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)

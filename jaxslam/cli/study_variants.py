@@ -7,21 +7,25 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.cli.life_options import LivingWorld, leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import name_errors
 from jaxslam.cli.world_options import Building, read_building
+from jaxslam.core.scan import Lidar
 from jaxslam.core.types import JUNCTION
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
-from jaxslam.io import robot_file
+from jaxslam.io import life_file, robot_file
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import buildings, drives, kinematics, scanner_presets
+from jaxslam.simulation import drives, kinematics, scanner_presets
 from jaxslam.simulation.arguments import as_robot
-from jaxslam.simulation.life import Life, life_in
+from jaxslam.simulation.ray_casting import Leaving
 from jaxslam.simulation.robot import Robot
-from jaxslam.study.runner import Variant
-from jaxslam.study.study_file import LIFE, PARTS, Settings, StudyFile, files_of
+from jaxslam.simulation.worlds import World
+from jaxslam.study.runner import Variant, fingerprint
+from jaxslam.study.settings import LIFE, Settings, files_of, with_life
+from jaxslam.study.study_file import StudyFile, same_variants
 
 OF_ROBOT = (
     *("max_speed", "max_turn_rate", "encoder_noise", "scan_period"),
@@ -46,23 +50,39 @@ def prepare(study: StudyFile) -> Prepared:
     """The variants of a study; all that they name is read and checked.
 
     Raises:
-        InputError: A file, a name or a number of a variant is not possible; the message names it.
+        InputError: A file, a name or a number of a variant is not possible, or contradicts another
+            one; or two variants are the same; the message names them.
     """
     notes: dict[str, None] = {}
-    found = []
-    slots = max(int(np.ceil(own.get("life.people", 0))) for _, own in study.variants)
-    for name, settings in study.variants:
+    found: dict[str, Variant] = {}
+    given = [with_life(one.settings, study.path.parent) for one in study.variants]
+    _check_used(study.path, given)
+    slots = max(own.get("life.people", 0) for own in given)
+    # All of them draw the same random numbers then, and run the same program.
+    lives = any(key in LIFE for own in given for key in own)
+    for (name, settings, cost), all_of_it in zip(study.variants, given, strict=True):
         with name_errors(f"{study.path}: {name}"):
             own = {key: settings[key] for key in study.varied if key in settings}
-            given = files_of(settings, study.path.parent)
-            found.append(_variant(name, own, given, slots, notes))
-    return Prepared(tuple(found), tuple(notes))
+            files = files_of(all_of_it, study.path.parent)
+            variant = _variant(
+                name, own, files, slots if lives else None, study.seed, notes
+            )._replace(cost=cost)
+        mark = fingerprint(variant, study.seed)
+        if mark in found:  # though their settings differ, as of a value that is the default
+            raise same_variants(study.path, found[mark].name, name)
+        found[mark] = variant
+    return Prepared(tuple(found.values()), tuple(notes))
 
 
 def _variant(
-    name: str, shown: Settings, given: Settings, slots: int, notes: dict[str, None]
+    name: str,
+    shown: Settings,
+    given: Settings,
+    slots: int | None,
+    seed: int,
+    notes: dict[str, None],
 ) -> Variant:
-    """The variant with some settings; adds to the notes."""
+    """The variant with some settings; adds to the notes. Without slots nothing goes wrong."""
     place = tuple(given.get(key) for key in ("world", "path", "drive", "resolution", "unit"))
     building = _building(*place)
     robot, config = _robot(given, notes)
@@ -73,17 +93,29 @@ def _variant(
         config = config._replace(
             filter=config.filter._replace(max_landmarks=given["max_landmarks"])
         )
-    path = np.asarray(building.path)
+    world, life = building.world, None
+    wrong = {LIFE[key]: x for key, x in given.items() if key in LIFE}
+    if slots is not None:
+        living = _living(place, tuple(wrong.items()), slots, seed)
+        world, life = living.world, living.life
+        notes |= dict.fromkeys([f"{name}: life: {living.note}"] if wrong else [])
+    lidar, path = config.frontend.lidar, np.asarray(building.path)
+    driven = path.tobytes(), str(path.dtype)
+    found = _leaving(lidar, np.asarray(world.walls, float).tobytes(), robot, *driven)
+    if found.beyond_range:
+        about = robot.scanner.name if robot.scanner else "the default scanner"
+        said = leaving_note(found, lidar.range_max)
+        notes |= dict.fromkeys([f"{building.name}, {about}: {said}"])
     return Variant(
         name,
         shown,
         config,
         _params(given, robot),
         robot,
-        building.world,
+        world,
         path,
-        _num_scans(robot, path.tobytes(), str(path.dtype)),
-        _life(given, building, slots),
+        _num_scans(robot, *driven),
+        life,
     )
 
 
@@ -104,6 +136,19 @@ def _num_scans(robot: Robot, path: bytes, dtype: str) -> int:
     return drives.num_scans_of_drive(robot, np.frombuffer(path, dtype).reshape(-1, 2))
 
 
+@lru_cache(maxsize=64)
+def _living(
+    place: tuple, wrong: tuple[tuple[str, float], ...], slots: int, seed: int
+) -> LivingWorld:
+    return life_of(_building(*place), dict(wrong), slots=slots, seed=seed)
+
+
+@lru_cache(maxsize=256)
+def _leaving(lidar: Lidar, walls: bytes, robot: Robot, path: bytes, dtype: str) -> Leaving:
+    world = World(jnp.asarray(np.frombuffer(walls).reshape(-1, 4), float))
+    return leaving(lidar, world, robot, np.frombuffer(path, dtype).reshape(-1, 2))
+
+
 def _robot(given: Settings, notes: dict[str, None]) -> tuple[Robot, Config]:
     """The robot of some settings, and the configuration for its scanner."""
     config = Config(frontend=FrontendConfig(labels=given.get("labels", "segments")))
@@ -117,6 +162,11 @@ def _robot(given: Settings, notes: dict[str, None]) -> tuple[Robot, Config]:
         robot = robot._replace(scanner=scanner, scan_period=1.0 / scanner.scan_rate)
         notes |= dict.fromkeys(f"{scanner.name}: {note}" for note in scanner.assumptions())
     robot = as_robot(robot._replace(**{k: given[k] for k in OF_ROBOT if k in given}))
+    if robot.scanner is not None and robot.scan_period * robot.scanner.scan_rate < 1.0 - 1e-6:
+        raise InputError(
+            f"scan_period is {robot.scan_period:g} s, and {robot.scanner.name} scans every "
+            f"{1.0 / robot.scanner.scan_rate:g} s; give at least that"
+        )
     if robot.scanner is not None:
         lidar = robot.scanner.lidar()
     return robot, Config.for_lidar(lidar, frontend=config.frontend, filter=config.filter)
@@ -138,31 +188,12 @@ def _params(given: Settings, robot: Robot) -> NoiseParams:
     return params._replace(**changed)
 
 
-def _life(given: Settings, building: Building, slots: int) -> Life | None:
-    """What goes wrong; None where no setting of it is there, so that nothing of it is computed."""
-    if not any(key in given for key in LIFE) and not slots:
-        return None
-    parts = {
-        part: record(**{f: given[f"life.{f}"] for f in record._fields if f"life.{f}" in given})
-        for part, record in PARTS.items()
-    }
-    if "life.moved_at" in given:
-        raise InputError("life.moved_at needs furniture, which a study does not name yet")
-    world = str(given.get("world", "office"))
-    doors = doors_of(world) if parts["traffic"].closed else None
-    return life_in(building.world, building.path, max_people=slots, doors=doors, **parts)
-
-
-def doors_of(world: str) -> np.ndarray:
-    """Closed doors (D, 4) [m] of a random building: lines in the middle of its walls.
-
-    Raises:
-        InputError: The doors of this world are not known.
-    """
-    if not world.startswith(buildings.PREFIX):
-        raise InputError(f"life.closed needs doors, and those of {world} are not known")
-    boxes = np.asarray(buildings.named_building(world).doors, float)
-    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
-    half = (boxes[:, 2:] - boxes[:, :2]) / 2
-    along = np.where((half[:, 0] >= half[:, 1])[:, None], half * [1, 0], half * [0, 1])
-    return np.hstack([middle - along, middle + along])
+def _check_used(path: Path, given: list[Settings]) -> None:
+    """Raise InputError if a setting of what goes wrong says nothing in any variant."""
+    wrong = life_file.unused(
+        {LIFE[key]: x for key, x in own.items() if key in LIFE} for own in given
+    )
+    if wrong is not None:
+        key, other = wrong
+        problem = f"says nothing without life.{other}"
+        raise InputError(problem, path=path, field=f"life.{key}", advice=f"add life.{other}")

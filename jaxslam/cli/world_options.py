@@ -29,11 +29,15 @@ class Building(NamedTuple):
         world: Walls, in JAX's precision.
         path: (N, 2) [m, world frame] points of the drive.
         notes: What was assumed, left out or found.
+        name: Of the world, or its file.
+        occupancy: The map that the walls are the outline of; None if there is none.
     """
 
     world: World
     path: Array
     notes: tuple[str, ...]
+    name: str = ""
+    occupancy: OccupancyMap | None = None
 
 
 def read_building(
@@ -90,12 +94,14 @@ def read_building(
             found = named_worlds.found_drive(building.world, drive, building.occupancy)
         walls = World(jnp.asarray(building.world.walls, float))
         notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
-        return Building(walls, jnp.asarray(found.path, float), tuple(notes))
+        driven = jnp.asarray(found.path, float)
+        return Building(walls, driven, tuple(notes), world, building.occupancy)
     elif points is None:
         advice = "add --drive patrol, or --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
         raise InputError("is a file, which has no drive of its own", path=world, advice=advice)
     walls = World(jnp.asarray(building.world.walls, float))
-    return Building(walls, jnp.asarray(path_following.densify(points), float), tuple(notes))
+    driven = jnp.asarray(path_following.densify(points), float)
+    return Building(walls, driven, tuple(notes), world, building.occupancy)
 
 
 def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
@@ -113,8 +119,6 @@ def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
     notes = []
     if found.clearance < NEAR:
         notes.append(f"the path comes within {found.clearance:.2f} m of a wall")
-    if found.open_share > 0.0:
-        notes.append(f"{found.open_share:.1%} of the beams along the path meet no wall")
     return notes
 
 

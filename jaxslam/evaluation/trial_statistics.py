@@ -34,6 +34,26 @@ class Difference(NamedTuple):
     pairs: int
 
 
+class ShareDifference(NamedTuple):
+    """Difference of two shares of the same trials.
+
+    Attributes:
+        value: The second less the first.
+        low: Of its interval.
+        high: Likewise.
+        only_first: Trials that succeed in the first variant alone.
+        only_second: In the second alone.
+        p_value: Of the hypothesis that there is no difference.
+    """
+
+    value: float
+    low: float
+    high: float
+    only_first: int
+    only_second: int
+    p_value: float
+
+
 def proportion(successes: int, trials: int, confidence: float = CONFIDENCE) -> Interval:
     """Share of successes, with the score interval of Wilson (1927).
 
@@ -85,6 +105,71 @@ def paired_difference(first: Any, second: Any) -> Difference:
     unpaired = np.sqrt((np.var(a[good], ddof=1) + np.var(b[good], ddof=1)) / count)
     paired = np.std(gap, ddof=1) / np.sqrt(count)
     return Difference(float(gap.mean()), float(paired), float(unpaired), count)
+
+
+def share_difference(first: Any, second: Any) -> ShareDifference:
+    """Difference of the shares of successes of two variants over the same trials.
+
+    With b trials that succeed in the first alone and c in the second alone, of N,
+
+        (c - b) / (N + 2) +- z sqrt(b + c + 1 - (c - b)^2 / (N + 2)) / (N + 2)
+
+    and the p-value is that of b of b + c fair coins: the exact test of McNemar.
+
+    Args:
+        first: (N,) bool, which trials of the first variant succeed.
+        second: (N,) bool, of the second.
+
+    Raises:
+        ValueError: They are not bool, or not of the same trials, or there are none.
+
+    References:
+        Agresti, Min (2005), Simple improved confidence intervals for comparing matched
+        proportions, Statistics in Medicine 24; their adjusted Wald interval.
+    """
+    a, b = np.asarray(first), np.asarray(second)
+    if a.dtype != bool or b.dtype != bool or a.shape != b.shape or a.ndim != 1 or not len(a):
+        raise ValueError(f"first is {a.dtype} {a.shape} and second {b.dtype} {b.shape}, not bool")
+    lost, won, count = int((a & ~b).sum()), int((~a & b).sum()), len(a) + 2
+    middle = (won - lost) / count
+    half = stats.norm.ppf((1 + CONFIDENCE) / 2)
+    half *= np.sqrt(won + lost + 1 - (won - lost) ** 2 / count) / count
+    p_value = stats.binomtest(won, won + lost).pvalue if won + lost else 1.0
+    low, high = max(-1.0, middle - half), min(1.0, middle + half)
+    return ShareDifference(
+        (won - lost) / len(a), float(low), float(high), lost, won, float(p_value)
+    )
+
+
+def mean_interval(mean: float, standard_error: float, count: int) -> tuple[float, float]:
+    """Interval of a mean of N values by Student's t; not a number for fewer than two."""
+    if count < 2:
+        return np.nan, np.nan
+    half = stats.t.ppf((1 + CONFIDENCE) / 2, count - 1) * standard_error
+    return float(mean - half), float(mean + half)
+
+
+def p_value_of_mean(mean: float, standard_error: float, count: int) -> float:
+    """Of the hypothesis that the mean of N values is 0, by Student's t; 1 where none can be had."""
+    if count < 2 or not np.isfinite(mean) or (mean == 0.0 and standard_error == 0.0):
+        return 1.0
+    if standard_error == 0.0:
+        return 0.0
+    return float(2.0 * stats.t.sf(abs(mean) / standard_error, count - 1))
+
+
+def holm(p_values: Any) -> np.ndarray:
+    """P-values (K,) of K tests, adjusted so that all of them together err as one does.
+
+    References:
+        Holm (1979), A simple sequentially rejective multiple test procedure.
+    """
+    given = as_float64("p_values", p_values, ("K",))
+    order = np.argsort(given, kind="stable")
+    steps = given[order] * np.arange(len(given), 0, -1)
+    adjusted = np.empty_like(given)
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return adjusted
 
 
 def survival(times: Any, failed: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,10 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
             **{"rad": 1.0, "deg": DEGREE, "mrad": 0.001},
             **{"rad sqrt(m)": 1.0, "deg sqrt(m)": DEGREE, "mrad sqrt(m)": 0.001},
         },
+        "angle over a length": {"rad/m": 1.0, "mrad/m": 0.001, "deg/m": DEGREE},
+        "per angle": {"1/rad": 1.0, "1/deg": 1 / DEGREE},
         "ratio": {"": 1.0, "%": 0.01},
+        "number": {"": 1.0},
     }
 )
 """Units of each kind of quantity, in the SI unit of the kind, which is the first."""
@@ -54,7 +57,7 @@ def parse(value: Any, kind: str) -> float:
     units = UNITS[kind]
     first, *_ = units
     example = f'write "1.5 {first}"' if first else "write 1.5"
-    known = ", ".join(unit for unit in units if unit)
+    known = ", ".join(unit for unit in units if unit) or "none"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{value!r} is no {kind}"[:200], advice=f"{example}; units are {known}")
     if isinstance(value, str):

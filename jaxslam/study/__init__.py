@@ -4,5 +4,8 @@ from jaxslam.study.outcomes import Outcomes as Outcomes
 from jaxslam.study.outcomes import compare as compare
 from jaxslam.study.outcomes import failures_by_place as failures_by_place
 from jaxslam.study.outcomes import summarise as summarise
+from jaxslam.study.reporting import report as report
 from jaxslam.study.runner import Variant as Variant
 from jaxslam.study.runner import run as run
+from jaxslam.study.runner import run_timed as run_timed
+from jaxslam.study.wording import findings as findings

@@ -1,18 +1,21 @@
 """Outcome of each trial of a study, and what many of them say together."""
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxslam.core import se2_np
 from jaxslam.core.types import Metrics
+from jaxslam.evaluation import consistency
 from jaxslam.evaluation.consistency import CERTAIN_TRACE
 from jaxslam.evaluation.trial_statistics import (
+    Difference,
     Interval,
+    mean_interval,
+    p_value_of_mean,
     paired_difference,
     proportion,
     quantile,
+    share_difference,
     survival,
 )
 from jaxslam.pipeline.episodes import TrialResult
@@ -44,25 +47,21 @@ class Outcomes(NamedTuple):
 
 def outcomes_of(result: TrialResult) -> Outcomes:
     """Outcomes of some trials, whose scans are all there and whose truth is known."""
-    truth, estimate, cov = (np.asarray(x) for x in (result.truth, result.estimate, result.cov))
-    gap = (estimate - truth).astype(np.float64)
-    turn = se2_np.wrap_angle(gap[..., 2])
+    truth, cov = np.asarray(result.truth), np.asarray(result.cov)
+    with np.errstate(invalid="ignore"):
+        gap = np.asarray(consistency.pose_error(result.estimate, result.truth), np.float64)
     error = np.hypot(gap[..., 0], gap[..., 1])
     error = np.where(np.isfinite(error), error, np.inf)
-    full = np.concatenate([gap[..., :2], turn[..., None]], axis=-1)
-    usable = np.isfinite(full).all(axis=-1) & np.isfinite(cov).all(axis=(-2, -1))
-    usable &= np.trace(cov, axis1=-2, axis2=-1) >= CERTAIN_TRACE
-    safe_cov = np.where(usable[..., None, None], cov, np.eye(3)).astype(np.float64)
-    safe = np.where(usable[..., None], full, 0.0)
-    with np.errstate(all="ignore"):
-        solved = np.linalg.solve(safe_cov, safe[..., None])[..., 0]
-    value = np.sum(safe * solved, axis=-1) / 3
+    turn = np.where(np.isfinite(gap[..., 2]), gap[..., 2], np.pi)
+    value = np.asarray(consistency.nees(gap, cov), np.float64)
+    usable = np.isfinite(value) & (np.trace(cov, axis1=-2, axis2=-1) >= CERTAIN_TRACE)
     count = usable.sum(axis=1)
-    nees = np.where(count > 0, value.sum(axis=1) / np.maximum(count, 1), np.nan)
+    total = consistency.nees_per_dof(np.where(usable, value, 0.0).sum(axis=1))
+    nees = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return Outcomes(
         error.astype(np.float32),
         truth[..., :2].astype(np.float32),
-        np.sqrt(np.mean(np.where(np.isfinite(turn), turn, np.pi) ** 2, axis=1)),
+        np.sqrt(np.mean(turn**2, axis=1)),
         nees,
         np.asarray(result.finite) & np.isfinite(error).all(axis=1),
         np.asarray(result.num_updates).mean(axis=1),
@@ -70,15 +69,15 @@ def outcomes_of(result: TrialResult) -> Outcomes:
     )
 
 
-def concatenate(parts: Iterable[Outcomes]) -> Outcomes:
-    """Join the outcomes of groups of trials."""
-    return Outcomes(*(np.concatenate(x) for x in zip(*parts, strict=True)))
-
-
 def failed_at(outcomes: Outcomes, success_distance: float) -> np.ndarray:
     """First scan (N,) of each trial that is further off than `success_distance` [m]; T for none."""
     far = ~(outcomes.error <= success_distance)
     return np.where(far.any(axis=1), far.argmax(axis=1), far.shape[1])
+
+
+def succeeded(outcomes: Outcomes, success_distance: float) -> np.ndarray:
+    """Which trials (N,) are never further off than `success_distance` [m]."""
+    return np.asarray((outcomes.error <= success_distance).all(axis=1))
 
 
 def position_rmse(outcomes: Outcomes) -> np.ndarray:
@@ -118,16 +117,29 @@ def summarise(outcomes: Outcomes, *, success_distance: float, scan_period: float
 def compare(first: Outcomes, second: Outcomes, *, success_distance: float) -> Metrics:
     """Differences of the second variant from the first, over trials with the same numbers.
 
-    The RMSE is compared by the mean of its logarithm: `ratio` is that of typical errors.
+    The RMSE is compared by the mean of its logarithm: `position_rmse_ratio` is that of typical
+    errors, over trials in which both are finite.
     """
-    ok = [failed_at(x, success_distance) == x.error.shape[1] for x in (first, second)]
+    ok = [succeeded(x, success_distance) for x in (first, second)]
     success = paired_difference(*(x.astype(float) for x in ok))
+    share = share_difference(*ok)
     with np.errstate(divide="ignore"):
         rmse = paired_difference(*(np.log(position_rmse(x)) for x in (first, second)))
     return {
-        "success": success._asdict(),
+        "success": success._asdict() | share._asdict(),
         "log_position_rmse": rmse._asdict(),
-        "position_rmse_ratio": float(np.exp(rmse.mean)),
+        **ratio_of(rmse),
+    }
+
+
+def ratio_of(log_rmse: Difference) -> Metrics:
+    """Ratio of typical errors, with its interval and p-value, of the difference of logarithms."""
+    given = log_rmse.mean, log_rmse.standard_error, log_rmse.pairs
+    low, high = mean_interval(*given)
+    return {
+        "position_rmse_ratio": float(np.exp(log_rmse.mean)),
+        "position_rmse_ratio_interval": [float(np.exp(low)), float(np.exp(high))],
+        "position_rmse_p_value": p_value_of_mean(*given),
     }
 
 

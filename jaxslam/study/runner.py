@@ -1,27 +1,24 @@
 """Trials of all variants of a study, on all devices, kept in files so that a stop loses little."""
 
 import hashlib
-import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 
 from jaxslam.core import trace_cache
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.io.errors import InputError
-from jaxslam.io.output import replace
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import trials
 from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
-from jaxslam.study.outcomes import Outcomes, concatenate, outcomes_of
-
-TRIALS_PER_FILE = 64
+from jaxslam.study import kept_trials
+from jaxslam.study.kept_trials import Collected
+from jaxslam.study.outcomes import Outcomes, outcomes_of
 
 
 class Variant(NamedTuple):
@@ -36,7 +33,8 @@ class Variant(NamedTuple):
         world: Its building.
         path: (N, 2) [m, world] that it drives.
         num_scans: T, scans of a trial.
-        life: What may go wrong; None: nothing.
+        life: What may go wrong; None: nothing, and ranges have other numbers than with a life.
+        cost: In any currency; None: not known.
     """
 
     name: str
@@ -48,6 +46,7 @@ class Variant(NamedTuple):
     path: np.ndarray
     num_scans: int
     life: Life | None = None
+    cost: float | None = None
 
 
 class Progress(NamedTuple):
@@ -73,7 +72,8 @@ def run(
     """Run trials 0 to N - 1 of each variant; trial i of all of them has the same random numbers.
 
     The same call resumes where another was stopped, and its outcomes are the same bit for bit.
-    With several processes all must call it; process 0 keeps the files.
+    With several processes all must call it; process 0 keeps the files and has the outcomes, the
+    others None for each.
 
     Args:
         variants: Of the study.
@@ -89,46 +89,51 @@ def run(
         InputError: The folder cannot be written, or holds trials of something else.
         ValueError: An argument of a variant is not possible.
     """
+    timed = run_timed(variants, num_trials=num_trials, seed=seed, folder=folder, callback=callback)
+    return [one.record for one in timed]
+
+
+def run_timed(
+    variants: Sequence[Variant],
+    *,
+    num_trials: int,
+    seed: int,
+    folder: Path | None = None,
+    callback: Callable[[Progress], None] | None = None,
+) -> list[Collected]:
+    """As `run`; with the outcomes of each variant the seconds and memory that they took."""
     found = []
+    compiled = set()
     for number, variant in enumerate(variants):
-        own = None if folder is None else folder / f"{number:03d}"
-        found.append(_run_variant(number, variant, num_trials, seed, own, callback))
+        results = partial(_outcomes, variant, seed)
+        program = program_of(variant)
+        found.append(
+            kept_trials.collect(
+                results,
+                Outcomes,
+                num_trials,
+                folder=None if folder is None else folder / f"{number:03d}",
+                mark=fingerprint(variant, seed),
+                warm_up=program not in compiled,
+                callback=None if callback is None else _numbered(callback, number),
+            )
+        )
+        compiled.add(program)
     return found
 
 
-def _run_variant(
-    number: int,
-    variant: Variant,
-    num_trials: int,
-    seed: int,
-    folder: Path | None,
-    callback: Callable[[Progress], None] | None,
-) -> Outcomes:
-    leads = jax.process_index() == 0
-    mark = fingerprint(variant, seed)
-    done = list(_kept(folder, mark)) if leads and folder is not None else []
-    first = sum(len(part.finite) for part in done)
-    if jax.process_count() > 1:
-        first = int(multihost_utils.broadcast_one_to_all(np.int32(first)))
-    new: list[Outcomes] = []
-    for result in _results(variant, seed, num_trials, first):
-        new.append(outcomes_of(result))
-        first += len(new[-1].finite)
-        if sum(len(one.finite) for one in new) >= TRIALS_PER_FILE or first >= num_trials:
-            done.append(concatenate(new))
-            new = []
-            if leads and folder is not None:
-                _keep(folder, first, done[-1], mark)
-        if callback is not None:
-            callback(Progress(number, first))
-    return Outcomes(*(x[:num_trials] for x in concatenate(done)))
+def _numbered(callback: Callable[[Progress], None], number: int) -> Callable[[int], None]:
+    return lambda done: callback(Progress(number, done))
 
 
-def _results(
-    variant: Variant, seed: int, num_trials: int, first: int
+def _outcomes(variant: Variant, seed: int, num_trials: int, first: int) -> Iterator[Outcomes]:
+    return map(outcomes_of, results_of(variant, seed, num_trials, first))
+
+
+def results_of(
+    variant: Variant, seed: int, num_trials: int, first: int = 0
 ) -> Iterator[trials.TrialResult]:
-    if first >= num_trials:
-        return iter(())
+    """Results of trials `first` to N - 1 of a variant, some at a time, on all devices."""
     return trials.run_trials(
         jax.random.key(seed),
         variant.config,
@@ -143,6 +148,21 @@ def _results(
     )
 
 
+def program_of(variant: Variant) -> Hashable:
+    """What variants have in common for which the same program is compiled."""
+    given = variant.world, variant.path, variant.params, variant.life
+    leaves, tree = jax.tree.flatten(given)
+    fixed = variant.config, variant.robot, variant.num_scans
+    return (*fixed, tree, tuple(np.shape(x) for x in leaves))
+
+
+def in_numpy(variant: Variant) -> Variant:
+    """The variant with NumPy arrays, which go to other processes without a device."""
+    given = variant.world, variant.path, variant.params, variant.life
+    world, path, params, life = jax.tree.map(np.asarray, given)
+    return variant._replace(world=world, path=path, params=params, life=life)
+
+
 def fingerprint(variant: Variant, seed: int) -> str:
     """Text that two variants have in common if their trials are the same; its name does not count.
 
@@ -155,32 +175,3 @@ def fingerprint(variant: Variant, seed: int) -> str:
         array = np.asarray(x)
         text.update(repr(array.shape).encode() + np.asarray(array, np.float64).tobytes())
     return text.hexdigest()[:32]
-
-
-def _keep(folder: Path, end: int, part: Outcomes, mark: str) -> None:
-    """Write the trials before number `end` to a file, which appears whole or not at all."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", path=folder) from None
-    with replace(folder / f"{end - len(part.finite):07d}.npz") as file:
-        np.savez(file, mark=mark, **part._asdict())
-
-
-def _kept(folder: Path, mark: str) -> Iterator[Outcomes]:
-    """Kept trials, from number 0 without a gap."""
-    done = 0
-    for file in sorted(folder.glob("*.npz")):
-        if file.stem != f"{done:07d}":
-            return
-        try:
-            with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as saved:
-                other = str(saved["mark"])
-                part = Outcomes(*(saved[name] for name in Outcomes._fields))
-                done += len(part.finite)
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
-            raise InputError("is broken", path=file, advice="remove it") from None
-        if other != mark:
-            problem = "has trials of another variant, seed or version of this program"
-            raise InputError(problem, path=file, advice="remove it, or name another folder")
-        yield part

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import main, study_variants
-from jaxslam.study import runner, study_file
+from jaxslam.study import kept_trials, runner, study_file
 
 SMALL = """
 trials = 5
@@ -26,8 +26,15 @@ life.people = 4
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     (tmp_path / "p.csv").write_text("1.0,0.9\n2.2,0.9\n")
+    (tmp_path / "w.csv").write_text("x1,y1,x2,y2\n0,0,4,0\n4,0,4,4\n4,4,0,4\n0,4,0,0\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def no_trials(monkeypatch):
+    """Fail at once where a wrong study is taken to be right."""
+    monkeypatch.setattr(runner, "run_timed", None)
 
 
 def said_of(folder, text, capsys, *more):
@@ -47,21 +54,24 @@ def said_of(folder, text, capsys, *more):
         ('path = "none.csv"\n', "none.csv"),
         ('scanner = "LDS-9"\n', "s.toml: base: no scanner named 'LDS-9'; there are: LDS-01"),
         ('robot = "r.toml"\n', "r.toml"),
-        ('path = "p.csv"\nlife.closed = 0.2\n', "life.closed needs doors, and those of office are"),
-        ('path = "p.csv"\nlife.moved_at = 9\n', "life.moved_at needs furniture"),
+        ('world = "w.csv"\npath = "p.csv"\nlife.closed = 0.2\n', "closed needs doors, and none"),
+        ('path = "p.csv"\nlife.moved_at = 9\n', "life.moved_at: says nothing without life.moved;"),
+        ('path = "p.csv"\nlife.moved = 1\n', "life.moved: says nothing without life.moved_at;"),
+        ('path = "p.csv"\nlife = "none.toml"\n', "none.toml: does not exist"),
+        ('path = "p.csv"\nscanner = "LDS-01"\nscan_period = 0.05\n', "LDS-01 scans every 0.2 s"),
         ('path = "p.csv"\nodometry_factor = 0\n', "odometry_factor and sensor_factor are above 0"),
         ('path = "p.csv"\ndrive = "route"\n', "--drive: is not for a drive that --path gives"),
         ('path = "p.csv"\nscan_period = 0\n', "robot.scan_period is 0.0, not above 0"),
         ("life.persons = 2\n", "base: life.persons is not known; did you mean life."),
     ],
 )
-def test_what_is_wrong_is_one_line_and_nothing_is_written(folder, base, message, capsys):
+def test_what_is_wrong_is_one_line_and_nothing_is_written(folder, base, message, capsys, no_trials):
     assert message in said_of(folder, f"[base]\n{base}", capsys)
 
 
 def test_a_path_through_a_wall_is_refused(folder, capsys):
-    (folder / "w.csv").write_text("1.0,0.9\n11.0,8.0\n")
-    assert "w.csv" in said_of(folder, '[base]\npath = "w.csv"\n', capsys)
+    (folder / "q.csv").write_text("1.0,0.9\n11.0,8.0\n")
+    assert "q.csv: path goes through a wall" in said_of(folder, '[base]\npath = "q.csv"\n', capsys)
 
 
 def test_variants_have_the_settings_of_the_study(folder):
@@ -85,36 +95,68 @@ def test_variants_have_the_settings_of_the_study(folder):
     assert study_variants.prepare(study_file.read(folder / "s.toml")).variants[0].life is None
 
 
-def test_doors_of_a_random_building_are_in_its_openings():
-    doors = study_variants.doors_of("random:3")
-    length = np.hypot(*(doors[:, 2:] - doors[:, :2]).T)
-    assert len(doors) > 3 and length.min() > 0.7 and length.max() < 1.3
+def test_a_value_that_is_the_default_is_no_other_variant(folder, capsys):
+    base = '[base]\npath = "p.csv"\n[[variant]]\nname = "as it is"\n'
+    other = '[[variant]]\nname = "so fast"\nmax_speed = 0.6\n'
+    assert "variants: 'as it is' and 'so fast' are the same" in said_of(
+        folder, base + other, capsys
+    )
+
+
+def test_a_file_of_life_is_that_of_simulate(folder, capsys):
+    (folder / "life.toml").write_text('people = 3\nmissing = "10 %"\n')
+    text = '[base]\npath = "p.csv"\nlife = "life.toml"\n[vary]\nlife.missing = [0, 0.2]\n'
+    (folder / "s.toml").write_text(text)
+    found = study_variants.prepare(study_file.read(folder / "s.toml"))
+    assert [float(one.life.ranges.missing) for one in found.variants] == [0.0, 0.2]
+    assert all(float(one.life.traffic.people) == 3.0 for one in found.variants)
+    assert "missing 0: life: people 3, missing 0" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--processes", "0"], "--processes: 0 is not between 1 and 256"),
+        (["--process-id", "1"], "--coordinator-address: is missing"),
+        (["--coordinator-address", "a:1", "--num-processes", "2"], "--process-id: is not below"),
+    ],
+)
+def test_processes_that_do_not_fit_are_one_line(folder, options, message, capsys):
+    assert message in said_of(folder, '[base]\npath = "p.csv"\n', capsys, *options)
 
 
 @pytest.mark.slow
-def test_a_study_runs_resumes_and_writes_its_table(folder, capsys, monkeypatch):
+@pytest.mark.timeout(900)
+def test_a_study_runs_resumes_and_writes_its_page(folder, capsys, monkeypatch):
     (folder / "s.toml").write_text(SMALL)
     call = ["study", "s.toml", "--out", "o"]
     assert main.main([*call, "--dry-run"]) == 0
     said = capsys.readouterr().out
-    assert "2 variants of 5 trials" in said and "minutes on" in said
+    assert "2 variants of 5 trials" in said and "minutes on" in said and "MB of memory" in said
     assert not (folder / "o").exists()
-    whole = runner._run_variant
+    whole = kept_trials.collect
+    done = []
 
-    def stops(number, *more):
-        if number == 1:
+    def stops(*arguments, **more):
+        if done:
             raise KeyboardInterrupt("interrupted; the same command resumes")
-        return whole(number, *more)
+        done.append(whole(*arguments, **more))
+        return done[0]
 
-    monkeypatch.setattr(runner, "_run_variant", stops)
+    monkeypatch.setattr(kept_trials, "collect", stops)
     assert main.main(call) == 130
     assert list((folder / "o").glob("study_parts/000/*.npz"))
-    monkeypatch.setattr(runner, "_run_variant", whole)
+    monkeypatch.setattr(kept_trials, "collect", whole)
     assert main.main(call) == 0
-    assert sorted(x.name for x in (folder / "o").iterdir()) == ["study.json", "study.png"]
+    names = ["report.html", "study.json", "study.png", "trials.csv"]
+    assert sorted(x.name for x in (folder / "o").iterdir()) == names
     found = json.loads((folder / "o" / "study.json").read_text())
     assert [row["name"] for row in found["variants"]] == ["as it is", "people"]
     assert found["variants"][1]["settings"] == {"life.people": 4}
     assert all(row["success"]["value"] == 1.0 for row in found["variants"])
     assert found["variants"][1]["against_first"]["success"]["pairs"] == 5
-    assert "as it is" in capsys.readouterr().out
+    assert len((folder / "o" / "trials.csv").read_text().splitlines()) == 11
+    said = capsys.readouterr().out
+    assert "as it is" in said and "- All variants succeed equally often" in said
+    page = (folder / "o" / "report.html").read_text()
+    assert "All variants succeed equally often" in page and "people: life: people 4" in page

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from functools import cache
 from io import StringIO
 from time import monotonic, sleep
 
@@ -15,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import filter_benchmark, monte_carlo, processes, scaling
+from experiments import filter_benchmark, monte_carlo, scaling
 from jaxslam.core.scan import Lidar
 from jaxslam.core.types import CORNER, WALL
 from jaxslam.filtering.config import FilterConfig
@@ -29,22 +30,32 @@ from jaxslam.pipeline.episodes import TrialResult
 from jaxslam.simulation import worlds
 from jaxslam.simulation.path_following import densify
 from jaxslam.simulation.robot import Robot
+from jaxslam.study import kept_trials, processes
+from jaxslam.study.runner import Variant
 
 CONFIG = Config.for_lidar(
     Lidar(num_beams=91, angle_increment=np.pi / 90),
     frontend=FrontendConfig(grid=GridSpec(x_max=4.0, y_half=3.0)),
     filter=FilterConfig(max_landmarks=16, max_updates=4, landmark_kinds=(CORNER, WALL)),
 )
-CASE = monte_carlo.Case(
-    seed=5,
-    config=CONFIG,
-    robot=Robot(),
-    walls=np.asarray(worlds.named("fig07").walls),
-    path=densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
-    num_scans=4,
-)
+SEED = 5
 NUM_TRIALS = 10
 TIMED = {"seconds", "seconds_per_scan", "peak_mb", "processes", "devices"}
+
+
+@cache
+def case():
+    """What is driven; not made at import, where processes that start may not use JAX yet."""
+    return Variant(
+        "room",
+        {},
+        CONFIG,
+        NoiseParams.for_simulated_robot(),
+        Robot(),
+        worlds.named("fig07"),
+        densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
+        4,
+    )
 
 
 def untimed(numbers):
@@ -56,7 +67,7 @@ def untimed(numbers):
 def done(tmp_path_factory):
     """The numbers of one process, and the folder where it has kept its runs."""
     folder = tmp_path_factory.mktemp("one") / "runs"
-    return monte_carlo.work(CASE, NUM_TRIALS, folder, StringIO()), folder
+    return monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO()), folder
 
 
 def hello(text, stream):
@@ -93,7 +104,7 @@ def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypa
     monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
     flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
     monkeypatch.setenv("XLA_FLAGS", flags)
-    numbers = monte_carlo.compute(CASE, NUM_TRIALS, tmp_path / "runs", processes.local(2))
+    numbers = monte_carlo.compute(case(), SEED, NUM_TRIALS, tmp_path / "runs", processes.local(2))
     assert numbers["processes"] == numbers["devices"] == 2
     assert untimed(numbers) == untimed(done[0])
     (one,), (two,) = ([*folder.glob("*.npz")] for folder in (done[1], tmp_path / "runs"))
@@ -139,7 +150,7 @@ def test_a_process_that_ends_early_ends_all(who, how, kind, line, tmp_path, monk
 def test_a_process_that_is_missing_is_reported_in_one_line(number, tmp_path):
     """The command itself: the other one of two machines is never started."""
     port = processes.local(2).address.split(":")[1]
-    code = "import sys; from experiments import monte_carlo, processes; "
+    code = "import sys; from experiments import monte_carlo; from jaxslam.study import processes; "
     code += "processes.STARTUP_TIMEOUT = 6.0; sys.exit(monte_carlo.main(sys.argv[1:]))"
     options = ["--coordinator_address", f"127.0.0.1:{port}", "--num_processes", "2"]
     options += ["--process_id", str(number), "--runs", "8", "--out", str(tmp_path)]
@@ -155,7 +166,7 @@ def test_a_process_that_is_missing_is_reported_in_one_line(number, tmp_path):
 @pytest.mark.timeout(120)
 @pytest.mark.slow
 def test_no_process_outlives_the_one_that_started_it(tmp_path):
-    code = "from experiments import processes; from tests.experiments import test_monte_carlo; "
+    code = "from jaxslam.study import processes; from tests.experiments import test_monte_carlo; "
     code += "processes.run_group(processes.local(2), test_monte_carlo.idle)"
     own = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     parent = subprocess.Popen([sys.executable, "-c", code], env=own, stderr=subprocess.PIPE)
@@ -204,56 +215,40 @@ class Stop(Exception):
 def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_path, monkeypatch):
     """Stopped after the first file, as kill -9 would: a part of the next one is left."""
     folder = tmp_path / "runs"
-    monkeypatch.setattr(monte_carlo, "TRIALS_PER_FILE", 8)
-    real = monte_carlo.keep
+    monkeypatch.setattr(kept_trials, "TRIALS_PER_FILE", 8)
+    real = kept_trials._keep
 
     def stopping(*arguments):
         real(*arguments)
         raise Stop
 
-    monkeypatch.setattr(monte_carlo, "keep", stopping)
+    monkeypatch.setattr(kept_trials, "_keep", stopping)
     with pytest.raises(Stop):
-        monte_carlo.work(CASE, NUM_TRIALS, folder, StringIO())
-    monkeypatch.setattr(monte_carlo, "keep", real)
+        monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO())
+    monkeypatch.setattr(kept_trials, "_keep", real)
     (file,) = folder.iterdir()
     before = file.stat().st_mtime_ns
     (folder / ".123.tmp").write_bytes(b"half of")
-    numbers = monte_carlo.work(CASE, NUM_TRIALS, folder, StringIO())
+    numbers = monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO())
     assert untimed(numbers) == untimed(done[0]) and file.stat().st_mtime_ns == before
     assert [f.name for f in sorted(folder.glob("*.npz"))] == ["0000000.npz", "0000008.npz"]
 
 
-def test_trials_of_another_seed_or_program_are_not_mixed_in(done):
-    folder = done[1]
-    with pytest.raises(InputError, match="of another seed"):
-        monte_carlo.work(CASE._replace(seed=6), NUM_TRIALS, folder)
+def test_trials_of_another_seed_are_not_mixed_in(done):
+    with pytest.raises(InputError, match="has trials of another variant, seed"):
+        monte_carlo.work(case(), SEED + 1, NUM_TRIALS, done[1])
 
 
-def test_fingerprints_differ_for_all_that_matters():
-    params = NoiseParams.for_simulated_robot(*CASE.robot[:2])
-    cases = [
-        CASE,
-        CASE._replace(seed=1),
-        CASE._replace(num_scans=5),
-        CASE._replace(config=CONFIG._replace(filter=CONFIG.filter._replace(max_landmarks=8))),
-        CASE._replace(walls=CASE.walls + 1e-9),
-        CASE._replace(robot=Robot(encoder_noise=0.1)),
-    ]
-    assert len({monte_carlo.fingerprint(case, params) for case in cases}) == len(cases)
-    assert monte_carlo.fingerprint(CASE, params) == monte_carlo.fingerprint(CASE, params)
-
-
-def test_a_broken_file_is_named(tmp_path):
-    (tmp_path / "0000000.npz").write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(InputError, match=r"0000000\.npz.*broken.*remove it"):
-        monte_carlo.load(tmp_path, "")
+def kept(folder):
+    """The results in a folder of ten trials."""
+    (file,) = folder.glob("*.npz")
+    with np.load(file) as saved:
+        return TrialResult(*(saved[name] for name in TrialResult._fields))
 
 
 def test_the_distribution_is_that_of_the_trials(done):
     numbers, folder = done
-    (results,), _, _ = monte_carlo.load(
-        folder, monte_carlo.fingerprint(CASE, NoiseParams.for_simulated_robot(*CASE.robot[:2]))
-    )
+    results = kept(folder)
     off = np.linalg.norm((results.estimate - results.truth)[..., :2], axis=-1)
     rmse = np.sqrt(np.mean(off**2, axis=1))
     assert numbers["p50_m"] == pytest.approx(np.median(rmse))
@@ -267,8 +262,7 @@ def test_the_distribution_is_that_of_the_trials(done):
 
 def test_trials_that_are_not_finite_are_masked_and_listed(done):
     numbers, folder = done
-    mark = monte_carlo.fingerprint(CASE, NoiseParams.for_simulated_robot(*CASE.robot[:2]))
-    (results,), _, _ = monte_carlo.load(folder, mark)
+    results = kept(folder)
     import jax
 
     estimate = results.estimate.copy()
@@ -283,7 +277,7 @@ def test_trials_that_are_not_finite_are_masked_and_listed(done):
 
 def test_one_trial_is_replayed_alone(done):
     worst = done[0]["worst"][0]
-    alone = monte_carlo.replay(CASE, worst["run"])
+    alone = monte_carlo.replay(case(), SEED, worst["run"])
     assert alone["position_rmse_m"] == pytest.approx(worst["position_rmse_m"], rel=1e-12)
     np.testing.assert_array_equal(alone["worst"][0]["estimate"], worst["estimate"])
 

@@ -7,8 +7,7 @@ import pytest
 
 from jaxslam.evaluation import nees, nees_per_dof
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.study import outcomes as outcomes_module
-from jaxslam.study.outcomes import compare, concatenate, failures_by_place, outcomes_of, summarise
+from jaxslam.study.outcomes import compare, failures_by_place, outcomes_of, summarise
 
 N, T = 30, 20
 
@@ -72,13 +71,6 @@ def test_variants_are_compared_by_trials_with_the_same_numbers():
     np.testing.assert_allclose(alike["position_rmse_ratio"], 2.0, rtol=1e-5)
     assert alike["log_position_rmse"]["standard_error"] < 1e-6
     assert alike["log_position_rmse"]["unpaired_standard_error"] > 1e-3
-
-
-def test_parts_are_joined_in_order():
-    whole = outcomes_of(results())
-    parts = [outcomes_module.Outcomes(*(x[k : k + 10] for x in whole)) for k in (0, 10, 20)]
-    for a, b in zip(concatenate(parts), whole, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_a_variant_of_which_all_trials_fail_has_numbers():

@@ -6,8 +6,8 @@ import pytest
 from jaxslam import Config, NoiseParams
 from jaxslam.core.scan import Lidar
 from jaxslam.io.errors import InputError
-from jaxslam.simulation import Robot, densify, named
-from jaxslam.study import runner
+from jaxslam.simulation import Robot, World, densify, life_in, named
+from jaxslam.study import kept_trials, runner
 from jaxslam.study.runner import Variant, run
 
 LIDAR = Lidar(num_beams=61, angle_min=-1.5, angle_increment=0.05)
@@ -30,7 +30,7 @@ def variant(name="a", **changes):
 
 @pytest.fixture
 def small_files(monkeypatch):
-    monkeypatch.setattr(runner, "TRIALS_PER_FILE", 4)
+    monkeypatch.setattr(kept_trials, "TRIALS_PER_FILE", 4)
 
 
 class Stop(Exception):
@@ -60,8 +60,8 @@ def test_a_study_that_is_stopped_ends_with_the_same_outcomes(tmp_path, small_fil
     seen = []
     found = run(both, num_trials=10, seed=3, folder=tmp_path, callback=seen.append)
     assert_same(found, whole)
-    assert {one.variant for one in seen} == {1}  # the first variant was done
-    assert_same(run(both, num_trials=10, seed=3, folder=tmp_path, callback=seen.clear), whole)
+    assert seen[0] == (0, 10) and {one.variant for one in seen[1:]} == {1}  # the first was done
+    assert_same(run(both, num_trials=10, seed=3, folder=tmp_path), whole)
     np.testing.assert_array_equal(whole[0].place, whole[1].place)  # the same drives
     assert np.any(whole[0].error != whole[1].error)
 
@@ -78,3 +78,27 @@ def test_trials_of_something_else_are_refused(tmp_path, small_files):
     with pytest.raises(InputError, match="is broken"):
         run([variant()], num_trials=4, seed=3, folder=tmp_path)
     assert runner.fingerprint(variant("other name"), 3) == runner.fingerprint(variant(), 3)
+
+
+def test_fingerprints_differ_for_all_that_matters():
+    living = life_in(named("office"), PATH, max_people=2)
+    more = living._replace(traffic=living.traffic._replace(people=np.float32(1.0)))
+    walls = named("office").walls
+    cases = [
+        variant(),
+        variant(num_scans=5),
+        variant(config=CONFIG._replace(filter=CONFIG.filter._replace(max_landmarks=8))),
+        variant(params=NoiseParams.for_simulated_robot(0.4, 0.02)),
+        variant(world=World(walls + 1e-9)),
+        variant(path=PATH + 1e-9),
+        variant(robot=Robot(encoder_noise=0.1)),
+        variant(life=living),
+        variant(life=more),
+    ]
+    marks = {runner.fingerprint(one, 3) for one in cases}
+    assert len(marks | {runner.fingerprint(variant(), 4)}) == len(cases) + 1
+    # Numbers that are traced need no program of their own.
+    programs = [runner.program_of(one) for one in cases]
+    assert programs[0] == programs[3] == programs[4] == programs[5]
+    assert programs[7] == programs[8] and len(set(programs)) == 5
+    assert runner.fingerprint(runner.in_numpy(cases[7]), 3) == runner.fingerprint(cases[7], 3)

@@ -33,12 +33,12 @@ class Group(NamedTuple):
 
     Attributes:
         address: HOST:PORT at which process 0 coordinates them.
-        count: Number of processes.
+        total: Number of processes.
         own: Numbers of those started here.
     """
 
     address: str
-    count: int
+    total: int
     own: Sequence[int]
 
 
@@ -51,6 +51,30 @@ def local(count: int) -> Group:
     with socket.socket() as free:
         free.bind((LOOPBACK, 0))
         return Group(f"{LOOPBACK}:{free.getsockname()[1]}", count, range(count))
+
+
+def group_of(
+    count: int, address: str, total: int, number: int, names: Sequence[str]
+) -> Group | None:
+    """The processes that some options ask for; None for this one alone.
+
+    Args:
+        count: Processes of this machine, that work together.
+        address: HOST:PORT of process 0, of several machines; empty for this machine alone.
+        total: Number of processes on all machines.
+        number: Of the one to start here.
+        names: Of the last three options, for messages.
+
+    Raises:
+        InputError: The options do not fit together.
+    """
+    if not address:
+        if total or number >= 0:
+            raise InputError("is missing", field=names[0])
+        return local(count) if count > 1 else None
+    if not 0 <= number < total:
+        raise InputError(f"is not below {names[1]}", field=names[2])
+    return Group(address, total, (number,))
 
 
 def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
@@ -69,7 +93,8 @@ def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
     spawn = get_context("spawn")
     cores = max(1, num_cores() // len(group.own))
     logs = Path(tempfile.mkdtemp(prefix="processes-"))
-    children, results = {}, {}
+    children: dict[int, tuple] = {}
+    results: dict[int, Any] = {}
     # Ctrl-C reaches all processes of a terminal; only this one handles it.
     handler = _ignore_interrupts()
     try:
@@ -100,7 +125,7 @@ def run_group(group: Group, work: Callable, *arguments: Any) -> list[Any]:
 
 def _follow(group: Group, children: dict, results: dict, deadline: float, logs: Path) -> None:
     """Collect results of the children until all are complete, or one is lost."""
-    started = set()
+    started: set[int] = set()
     while pending := {k: c for k, c in children.items() if k not in results}:
         left = None if len(started) == len(children) else max(0.0, deadline - monotonic())
         events = [x for child, pipe in pending.values() for x in (child.sentinel, pipe)]
@@ -134,12 +159,12 @@ def _early(group: Group, ended: list, started: set[int], logs: Path) -> LostProc
             return _missing(group)
         why = "it has lost another one"
     why = f"exit code {why}" if isinstance(why, int) else why
-    return LostProcessError(f"process {number} of {group.count} ended early ({why}); see {logs}")
+    return LostProcessError(f"process {number} of {group.total} ended early ({why}); see {logs}")
 
 
 def _missing(group: Group) -> LostProcessError:
     return LostProcessError(
-        f"not all of {group.count} processes came up at {group.address}; start every one"
+        f"not all of {group.total} processes came up at {group.address}; start every one"
     )
 
 
@@ -175,7 +200,7 @@ def _child(
         bind = group.address if group.address.startswith(LOOPBACK) else None
         jax.distributed.initialize(
             group.address,
-            group.count,
+            group.total,
             number,
             cluster_detection_method="deactivate",
             initialization_timeout=int(wait) + 1,
@@ -204,7 +229,9 @@ def _leave(pipe: connection.Connection, message: tuple[str, str]) -> None:
 
 
 def _end_with_parent() -> None:
-    connection.wait([parent_process().sentinel])
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
     os._exit(1)
 
 

@@ -1,0 +1,103 @@
+"""What goes wrong in a building, from settings of `jaxslam simulate --life` or of a study."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.cli.world_options import Building
+from jaxslam.core import polylines
+from jaxslam.core.scan import Lidar
+from jaxslam.core.se2 import compose
+from jaxslam.io import life_file
+from jaxslam.io.errors import InputError
+from jaxslam.simulation import buildings, moving_parts, ray_casting, worlds
+from jaxslam.simulation.life import Life, life_in
+from jaxslam.simulation.ray_casting import Leaving
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.worlds import World
+
+MAX_POSES = 100  # along a drive, from which beams are followed
+
+
+class LivingWorld(NamedTuple):
+    """A building in which things go wrong.
+
+    Attributes:
+        world: Walls of what stays where it is.
+        life: What goes wrong.
+        note: The same in a line.
+    """
+
+    world: World
+    life: Life
+    note: str
+
+
+def life_of(
+    building: Building,
+    settings: Mapping[str, float],
+    *,
+    slots: int | None = None,
+    seed: int = 0,
+) -> LivingWorld:
+    """Life in a building.
+
+    Args:
+        building: What is driven through, and where.
+        settings: By the keys of `life_file.SETTINGS`.
+        slots: For people; by default as many as there are.
+        seed: Of which furniture is moved, and where to.
+
+    Raises:
+        InputError: There are no doors to close, or no furniture to move.
+        ValueError: A number is not possible.
+    """
+    parts = life_file.parts(settings)
+    moves = parts.pop("furniture")
+    note = life_file.describe(settings)
+    world, doors, furniture = building.world, None, None
+    if parts["traffic"].closed:
+        doors = _doors(building)
+        if not len(doors):
+            raise InputError(f"closed needs doors, and none are found in {building.name}")
+        note += f"; {len(doors)} doors"
+    if moves.moved:
+        found = moving_parts.move_furniture(world.walls, building.path, moves, seed)
+        if not found.pieces:
+            raise InputError(f"moved needs loose furniture; none can be moved in {building.name}")
+        world, furniture = World(jnp.asarray(found.fixed, float)), (found.before, found.after)
+        note += f"; {found.pieces} pieces of furniture are moved"
+    life = life_in(
+        world, building.path, max_people=slots, doors=doors, furniture=furniture, **parts
+    )
+    return LivingWorld(world, life, note)
+
+
+def _doors(building: Building) -> np.ndarray:
+    """Closed doors (D, 4) [m] of a building: known ones, or those between its rooms."""
+    if building.name in worlds.NAMES or building.name.startswith(buildings.PREFIX):
+        return moving_parts.doors_by_name(building.name)
+    return moving_parts.find_doors(building.world.walls, building.occupancy)
+
+
+def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
+    """Shares of the beams along a drive (N, 2) [m] that meet no wall."""
+    points = np.asarray(path, float)
+    count = int(np.clip(float(polylines.length(points)) / robot.max_speed, 2, MAX_POSES))
+    even = polylines.resample(points, count)
+    along = np.gradient(even, axis=0)
+    poses = jnp.asarray(np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])]), float)
+    for mount in (robot.nominal_mount, robot.mount):
+        poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(mount, float))
+    return ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
+
+
+def leaving_note(found: Leaving, range_max: float) -> str:
+    """The same in a line."""
+    return (
+        f"{found.no_wall:.1%} of the beams along the drive leave the building, "
+        f"{found.beyond_range:.1%} meet nothing within {range_max:g} m"
+    )

@@ -1,0 +1,146 @@
+"""What goes wrong in life, in a file: TOML or JSON, for `jaxslam simulate --life FILE`.
+
+A value is a number in the SI unit, or a text with its unit ("0.8 m/s", "10 %"); an unknown key is
+an error. In a study (`study.study_file`) the same keys are called `life.KEY`. What is not there
+does not happen.
+
+    people            number of them, walking to and fro along the drive
+      speed, standing, carts, distance       of people: mean speed, share of the time and of them
+    closed            share of the time in which each door is closed
+      door_period     after which a door may change
+    moved             share of the loose furniture that is moved, by `moved_by`, at `moved_at`
+    missing           probability that a beam does not return
+    black, glass      share of the walls: `black_range` and `glass_angle` in which they are seen
+    std_scale, std_per_range, std_by_incidence, resolution, spot     errors of ranges
+    slip, carpet      of wheels: probability with `slip_share`, share of the floor and `carpet_turn`
+    lost              probability that odometry fails, for `lost_scans`, `latched` or standing
+    dropped           probability that a scan is lost
+    carried           probability that the robot is carried once, `carry` along its path
+
+`simulation`'s `RangeErrors`, `Traffic`, `WheelFaults` and `Moves` say what each is exactly.
+"""
+
+from collections.abc import Iterable, Mapping
+from os import PathLike
+from types import MappingProxyType
+from typing import Any
+
+from jaxslam.io import toml_or_json
+from jaxslam.io.quantities import Table
+from jaxslam.simulation.life import AT_LEAST_ONE, POSITIVE, PROBABILITIES
+from jaxslam.simulation.moving_parts import Moves
+from jaxslam.simulation.range_errors import RangeErrors
+from jaxslam.simulation.traffic import Traffic
+from jaxslam.simulation.wheel_faults import WheelFaults
+
+EXAMPLE = """\
+people = 5
+speed = "0.8 m/s"
+missing = "5 %"          # of the beams
+closed = 0.2             # of the time, each door
+slip = 0.01
+"""
+
+PARTS: Mapping[str, Any] = MappingProxyType(
+    {"ranges": RangeErrors, "traffic": Traffic, "wheels": WheelFaults, "furniture": Moves}
+)
+"""The records whose fields are the keys."""
+
+SETTINGS: Mapping[str, str] = MappingProxyType(
+    {field: part for part, record in PARTS.items() for field in record._fields}
+)
+"""Each key, and the part of life that it is of."""
+
+WHOLE = frozenset({"people"})
+"""Keys of whole numbers."""
+
+KINDS = {
+    **dict.fromkeys(("resolution", "black_range", "distance", "carry", "moved_by"), "length"),
+    **dict.fromkeys(("spot", "glass_angle"), "angle"),
+    **dict.fromkeys(("door_period", "moved_at"), "time"),
+    **{"speed": "speed", "std_by_incidence": "per angle", "carpet_turn": "angle over a length"},
+    **dict.fromkeys(("people", "lost_scans"), "number"),
+}
+"""Kinds of `quantities`, of those keys that are no ratios."""
+
+NEEDS = {
+    **dict.fromkeys(("speed", "standing", "carts", "distance"), "people"),
+    **{"door_period": "closed", "moved_by": "moved", "moved_at": "moved", "moved": "moved_at"},
+    **{"black_range": "black", "glass_angle": "glass", "slip_share": "slip"},
+    **{"carpet_turn": "carpet", "lost_scans": "lost", "latched": "lost", "carry": "carried"},
+}
+"""Keys that say nothing without another one."""
+
+_MOST = 1e6
+
+
+def read(path: str | PathLike) -> dict[str, float]:
+    """Read what goes wrong.
+
+    Args:
+        path: TOML or JSON file, as above.
+
+    Returns:
+        Numbers in SI units by their keys, as they are in the file.
+
+    Raises:
+        InputError: The file cannot be read, or is neither; a key is unknown, or says nothing
+            without another one; a value is not possible, or has an unknown unit.
+    """
+    advice = "write KEY = NUMBER; jaxslam.io.life_file has the keys"
+    content = toml_or_json.read(path, advice)
+    table = Table(path, "life", content)
+    table.check_keys(tuple(SETTINGS))
+    found = {key: number(table, key, given) for key, given in content.items()}
+    missing = unused([found])
+    if missing is not None:
+        raise table.error(missing[0], f"says nothing without {missing[1]}", f"add {missing[1]}")
+    return found
+
+
+def number(table: Table, key: str, given: Any) -> float:
+    """The value of a key in its SI unit.
+
+    Args:
+        table: Where it is, for the message.
+        key: One of `SETTINGS`.
+        given: A number, or a text with a unit.
+
+    Raises:
+        InputError: It is no such quantity, or not possible.
+    """
+    part = SETTINGS[key]
+    low, high = 0.0, 1.0 if key in (*PROBABILITIES.get(part, ()), "moved") else _MOST
+    if key in POSITIVE.get(part, ()):
+        low = 1e-6
+    elif key in AT_LEAST_ONE.get(part, ()):
+        low = 1.0
+    elif key == "std_by_incidence":
+        low = -_MOST
+    found = table.checked(key, given, KINDS.get(key, "ratio"), low, high)
+    if found is None or (key in WHOLE and found != int(found)):
+        raise table.error(key, f"{given!r} is no whole number")
+    return int(found) if key in WHOLE else found
+
+
+def unused(all_settings: Iterable[Mapping[str, float]]) -> tuple[str, str] | None:
+    """A key that says nothing in any of these settings, and the one that it needs; None if none."""
+    everywhere = list(all_settings)
+    for key, other in NEEDS.items():
+        given = [own for own in everywhere if key in own]
+        if given and not any(own.get(other) for own in given):
+            return key, other
+    return None
+
+
+def parts(settings: Mapping[str, float]) -> dict[str, Any]:
+    """The records of `PARTS` by their names, with these settings."""
+    return {
+        part: record(**{key: settings[key] for key in record._fields if key in settings})
+        for part, record in PARTS.items()
+    }
+
+
+def describe(settings: Mapping[str, float]) -> str:
+    """What goes wrong, in a line."""
+    return ", ".join(f"{key} {value:g}" for key, value in settings.items())

@@ -17,7 +17,8 @@ beams and lost scans are split as well as the noise of encoders. The size follow
 moves that are accepted.
 
 The standard error counts a chain and its relatives, those that begin in the same chain of the level
-before, as one draw, because they are not independent.
+before, as one draw, because they are not independent. It is good where scores rise little by little
+to a failure, and too small where a failure comes at once: see `RareFailure.is_uncertain`.
 
 References:
     Au, Beck (2001), "Estimation of small failure probabilities in high dimensions by subset
@@ -28,7 +29,6 @@ References:
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -41,7 +41,8 @@ from jaxslam.evaluation.trial_statistics import CONFIDENCE, Interval, proportion
 
 ACCEPTANCE = 0.4  # share of moves to be accepted
 MOVES = 0.02, 1.0  # least and largest size of a move
-FIRST_MOVE = 0.5
+FIRST_MOVE = 0.2
+FEW_CHAINS = 0.5  # relative error of a level above which its chains are too few
 
 
 class Level(NamedTuple):
@@ -88,6 +89,15 @@ class RareFailure(NamedTuple):
     def reached(self) -> bool:
         """Whether a trial failed."""
         return bool(self.levels[-1].threshold >= self.threshold and len(self.scores))
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether the trials of a level are those of few families: the interval may be too short.
+
+        It is so where the score does not show how near a failure is, because it comes at once, as
+        where data association goes wrong: take more `level_trials`, and another key.
+        """
+        return any(level.relative_error > FEW_CHAINS for level in self.levels)
 
     @property
     def plain_trials(self) -> float:
@@ -180,11 +190,14 @@ def rare_failure(
 def describe(found: RareFailure, unit: str = "m") -> str:
     """What was found, in one line."""
     end = f"{found.num_trials} trials"
+    if found.is_uncertain:
+        end += " of few families: take more for each level"
     if found.reached:
         p, low, high = found.probability
         return (
             f"probability of more than {found.threshold:g} {unit}: {p:.2g} "
-            f"({low:.2g} to {high:.2g}), {end}; as well known from {found.plain_trials:.0f} plain ones"
+            f"({low:.2g} to {high:.2g}), {end}; as well known from "
+            f"{found.plain_trials:.0f} plain ones"
         )
     highest = found.levels[-1].threshold
     return (
@@ -199,29 +212,20 @@ def move_noise(key: Key, size: Any, noise: Any) -> Any:
 
     Args:
         key: Of the move.
-        size: [-] 1 for noise that is independent of the one before, 0 for the same; of what is not
-            normal, at least one part of each trial is drawn anew.
+        size: [-] 1 for noise that is independent of the one before, 0 for the same.
         noise: [B] of trials, as of `rare_failure`.
     """
     leaves, tree = jax.tree.flatten(noise)
-    of_parts, of_one, *own = jax.random.split(key, 2 + len(leaves))
-    batch = leaves[0].shape[0]
-    sizes = [math.prod(x.shape[1:]) if _is_key(x) else 0 for x in leaves]
-    anew = jax.random.uniform(of_parts, (batch, sum(sizes))) < size
-    if sum(sizes):
-        one = jax.random.randint(of_one, (batch,), 0, sum(sizes))
-        anew |= one[:, None] == jnp.arange(sum(sizes), dtype=one.dtype)[None]
-    moved, begin = [], 0
-    for x, key_of, count in zip(leaves, own, sizes, strict=True):
-        if not _is_key(x):
+    moved = []
+    for x, own in zip(leaves, jax.random.split(key, len(leaves)), strict=True):
+        if _is_key(x):
+            of_choice, of_new = jax.random.split(own)
+            chosen = jax.random.uniform(of_choice, x.shape) < size
+            moved.append(jnp.where(chosen, jax.random.split(of_new, x.shape), x))
+        else:
             kept = jnp.asarray(1.0 - size, x.dtype)
-            z = jax.random.normal(key_of, x.shape, x.dtype)
+            z = jax.random.normal(own, x.shape, x.dtype)
             moved.append(kept * x + jnp.sqrt(1.0 - kept**2) * z)
-            continue
-        chosen = anew[:, begin : begin + count].reshape(x.shape)
-        new = jax.random.split(key_of, x.shape)
-        moved.append(jnp.where(chosen, new, x))
-        begin += count
     return jax.tree.unflatten(tree, moved)
 
 
@@ -253,7 +257,7 @@ def _share(above: np.ndarray, family: np.ndarray) -> tuple[float, float]:
 
 
 def _seeds(key: Key, reached: np.ndarray, count: int) -> np.ndarray:
-    """Trials that begin chains: all that reached a level, in random order, or some of them twice."""
+    """Trials that begin chains: those that reached a level in random order, some of them twice."""
     order = np.asarray(jax.random.permutation(jax.random.fold_in(key, 0), len(reached)))
     return reached[order[np.arange(count) % len(reached)]]
 
@@ -278,7 +282,13 @@ def _result(
     scores = scores if is_reached else scores[:0]
     failures = jax.tree.map(lambda x: x[: len(scores)], failures)
     return RareFailure(
-        interval, error if is_reached else math.nan, threshold, num_trials, tuple(levels), failures, scores
+        interval,
+        error if is_reached else math.nan,
+        threshold,
+        num_trials,
+        tuple(levels),
+        failures,
+        scores,
     )
 
 

@@ -37,8 +37,15 @@ def final_error(result: TrialResult) -> Array:
     return jnp.sqrt(jnp.sum(gap**2))
 
 
-class _Common(NamedTuple):
-    """What all trials have in common, as `Variant` has it."""
+class Common(NamedTuple):
+    """What all trials have in common.
+
+    Attributes:
+        params: Q and R that the filter assumes.
+        world: The world.
+        path: (N, 2) [m, world].
+        life: What may go wrong; None: nothing.
+    """
 
     params: NoiseParams
     world: World
@@ -66,7 +73,7 @@ class TrialsFromNoise:
         self._score = score
         world = jax.tree.map(_in_precision, variant.world)
         path = jnp.asarray(variant.path, float)
-        self._common = _Common(variant.params, world, path, variant.life)
+        self._common = Common(variant.params, world, path, variant.life)
 
     def draw(self, keys: Key) -> TrialNoise:
         """Noise [B] of trials with the keys (B,)."""
@@ -74,18 +81,28 @@ class TrialsFromNoise:
         return draw_noises(keys, own.config.frontend.lidar, own.robot, own.num_scans)
 
     def noise_of(self, seed: int, numbers: np.ndarray) -> TrialNoise:
-        """Noise [B] of plain trials with the numbers (B,), each the same whatever the others are."""
+        """Noise [B] of plain trials with the numbers (B,), each the same in any company."""
         return self.draw(trial_keys(jax.random.key(seed), jnp.asarray(numbers, jnp.int32)))
 
     def score(self, noise: TrialNoise) -> np.ndarray:
         """Scores (B,) of trials with the noise [B]; NaN where the estimate is not finite."""
-        return self._run(_score_group, noise)
+        return self.spread(_SCORES, noise, self._score)
 
     def results(self, noise: TrialNoise) -> TrialResult:
         """Results [B] of trials with the noise [B]."""
-        return self._run(_filter_group, noise)
+        return self.spread(_RESULTS, noise, self._score)
 
-    def _run(self, spread: DeviceMap, noise: TrialNoise) -> Any:
+    def spread(self, mapped: DeviceMap, noise: TrialNoise, static: Any, *given: Array) -> Any:
+        """Results of a function of a group of `EPISODE_BATCH` trials, on all devices.
+
+        Args:
+            mapped: Of configuration of front end and filter, robot, `static`, type of keys; what
+                is common; and the noise of a group, whose keys are data: `with_keys`.
+            noise: [B] of the trials.
+            static: Hashable argument.
+            given: Arrays that all trials have in common, in addition; without any, what is common
+                is a `Common` alone.
+        """
         count = leading_size("noise", noise.wheels)
         data = noise._replace(
             start=jax.random.key_data(noise.start), scans=jax.random.key_data(noise.scans)
@@ -93,10 +110,16 @@ class TrialsFromNoise:
         data = pad_to(data, to=count + -count % EPISODE_BATCH)
         groups = jax.tree.map(lambda x: x.reshape(-1, EPISODE_BATCH, *x.shape[1:]), data)
         own = self._variant
-        static = own.config.frontend, own.config.filter, own.robot, self._score
-        kind = jax.random.key_impl(noise.start)
-        found = spread(*static, kind, self._common, groups)
+        fixed = own.config.frontend, own.config.filter, own.robot, static
+        common = (self._common, *given) if given else self._common
+        found = mapped(*fixed, jax.random.key_impl(noise.start), common, groups)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+
+
+def with_keys(data: TrialNoise, key_type: Any) -> TrialNoise:
+    """Noise whose keys are given as data."""
+    keys = (jax.random.wrap_key_data(x, impl=key_type) for x in (data.start, data.scans))
+    return TrialNoise(data.wheels, data.ranges, *keys)
 
 
 def _filter(
@@ -105,16 +128,14 @@ def _filter(
     robot: Robot,
     score: Score,
     key_type: Any,
-    common: _Common,
+    common: Common,
     data: TrialNoise,
 ) -> TrialResult:
     """Simulate the trials of a group in turn, and filter them together."""
 
     def simulate(one: TrialNoise) -> Any:
-        keys = (jax.random.wrap_key_data(x, impl=key_type) for x in (one.start, one.scans))
-        noise = TrialNoise(one.wheels, one.ranges, *keys)
         given = frontend, robot, common.world, common.path
-        return simulate_from_noise(noise, *given, life=common.life)
+        return simulate_from_noise(with_keys(one, key_type), *given, life=common.life)
 
     return filter_batch(config, common.params, jax.lax.map(simulate, data))
 
@@ -125,7 +146,7 @@ def _scores(
     robot: Robot,
     score: Score,
     key_type: Any,
-    common: _Common,
+    common: Common,
     data: TrialNoise,
 ) -> Array:
     """Scores of the trials of a group."""
@@ -133,8 +154,8 @@ def _scores(
     return jnp.where(result.finite, jax.vmap(score)(result), jnp.nan)
 
 
-_filter_group = DeviceMap(_filter, size=1, static=5)
-_score_group = DeviceMap(_scores, size=1, static=5)
+_RESULTS = DeviceMap(_filter, size=1, static=5)
+_SCORES = DeviceMap(_scores, size=1, static=5)
 
 
 def _in_precision(x: Any) -> Array:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,26 @@ from jaxslam.simulation.worlds import World
 SUBSTEPS = 4  # parts of the motion between two scans with encoder noise of their own
 LIFE = 1  # number of the key of what goes wrong, of that of a drive
 MAX_DEPARTURE = 0.5  # [m] from its path, of a robot that cannot turn on the spot
+
+
+class Draws(NamedTuple):
+    """All that is random on a drive of T scans, drawn.
+
+    Attributes:
+        wheels: (T - 1, SUBSTEPS, D) standard normals of the encoders.
+        scans: (T,) keys of the scans.
+        ranges: (T, R) standard normals of the ranges; None: those of the keys.
+        events: What happens on this drive; None: nothing.
+        failures: (T, 3) uniform draws of the odometry's failures; None: it does not fail.
+        kept: (T,) bool, which scans are not lost; None: none is.
+    """
+
+    wheels: Array
+    scans: Key
+    ranges: Array | None = None
+    events: Events | None = None
+    failures: Array | None = None
+    kept: Array | None = None
 
 
 def start_pose(path: Array) -> Array:
@@ -67,9 +87,21 @@ def drive(
         robot, or of the scanner at `robot.nominal_mount`, as odometry reports them, zero at the
         first.
     """
-    first = start_pose(path)
     shape = num_scans - 1, SUBSTEPS, kinematics.num_draws(robot)
     draws = jax.random.normal(key, shape, path.dtype)
+    return drive_as_drawn(draws, robot, path, life=life, events=events)
+
+
+def drive_as_drawn(
+    draws: Array,
+    robot: Robot,
+    path: Array,
+    *,
+    life: Life | None = None,
+    events: Events | None = None,
+) -> tuple[Array, Array]:
+    """`drive` by standard normals (T - 1, SUBSTEPS, D), D = `kinematics.num_draws(robot)`."""
+    first, num_scans = start_pose(path), len(draws) + 1
     late = robot.time_offset / robot.scan_period  # [scans]
     whole, part = math.floor(late), late - math.floor(late)
 
@@ -220,27 +252,70 @@ def _drive(
         (T, 3); and odometry increments (T, 3).
     """
     drive_key, scan_key = jax.random.split(key)
-    keys = jax.random.split(scan_key, num_scans)
+    shape = num_scans - 1, SUBSTEPS, kinematics.num_draws(robot)
+    draws = Draws(
+        wheels=jax.random.normal(drive_key, shape, path.dtype),
+        scans=jax.random.split(scan_key, num_scans),
+    )
+    if life is not None:
+        of_events, of_odometry, of_scans = jax.random.split(jax.random.fold_in(key, LIFE), 3)
+        draws = draws._replace(
+            events=draw_events(of_events, life, num_scans),
+            failures=wheel_faults.draw_failures(of_odometry, num_scans, path.dtype),
+            kept=wheel_faults.keeps_scan(of_scans, life.wheels, num_scans, path.dtype),
+        )
+    given = lidar, robot, world, path
+    return drive_and_scan(draws, *given, noise_by_incidence=noise_by_incidence, life=life)
+
+
+def drive_and_scan(
+    draws: Draws,
+    lidar: Lidar,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+    mount_error: Array | None = None,
+) -> tuple[Callable[[tuple], Scan], tuple, Array]:
+    """A drive whose scans are still to be made.
+
+    Args:
+        draws: All that is random; `events`, `failures` and `kept` only with `life`.
+        lidar: The scanner as the front end knows it.
+        robot: The robot.
+        world: The walls.
+        path: (N, 2) [m, world] to drive along.
+        noise_by_incidence: As of `simulate_episode`.
+        life: What may go wrong; None: nothing.
+        mount_error: (3,) [m, m, rad] pose of the scanner in the frame of the scanner as the robot
+            has it, traced; None: zero.
+
+    Returns:
+        A function that makes a scan of an item; the items [T], of which the first is the true pose
+        (T, 3); and odometry increments (T, 3).
+    """
+    events, keys, ranges = draws.events, draws.scans, draws.ranges
+    truth, odometry = drive_as_drawn(draws.wheels, robot, path, life=life, events=events)
+    if mount_error is not None:
+        truth = jax.vmap(compose, in_axes=(0, None))(truth, mount_error)
     if life is None:
-        truth, odometry = drive(drive_key, robot, path, num_scans=num_scans)
         scan = partial(
             _scan, lidar, world, noise_by_incidence=noise_by_incidence, scanner=robot.scanner
         )
-        return (lambda item: scan(*item)), (truth, keys), odometry
+        return (lambda item: scan(*item)), (truth, keys, ranges), odometry
 
-    of_events, of_odometry, of_scans = jax.random.split(jax.random.fold_in(key, LIFE), 3)
-    events = draw_events(of_events, life, num_scans)
-    truth, odometry = drive(drive_key, robot, path, num_scans=num_scans, life=life, events=events)
-    odometry = wheel_faults.fail_odometry(of_odometry, life.wheels, odometry)
-    kept = wheel_faults.keeps_scan(of_scans, life.wheels, num_scans, truth.dtype)
-    times = robot.scan_period * jnp.arange(num_scans, dtype=truth.dtype)
+    odometry = wheel_faults.fail_as_drawn(draws.failures, life.wheels, odometry)
+    times = robot.scan_period * jnp.arange(len(truth), dtype=truth.dtype)
 
     def living(item: tuple) -> Scan:
-        pose, own, time, is_kept = item
-        scan = scan_life(own, lidar, robot.scanner, world, life, events, pose, time)
+        pose, own, normals, time, is_kept = item
+        given = lidar, robot.scanner, world, life, events, pose, time, normals
+        scan = scan_life(own, *given)
         return to_scan(lidar, jnp.where(is_kept & scan.hit, scan.ranges, jnp.inf))
 
-    return living, (truth, keys, times, kept), odometry
+    return living, (truth, keys, ranges, times, draws.kept), odometry
 
 
 def _scan(
@@ -248,6 +323,7 @@ def _scan(
     world: World,
     pose: Array,
     key: Key,
+    draws: Array | None = None,
     *,
     noise_by_incidence: float = 0.0,
     scanner: Scanner | None = None,
@@ -259,7 +335,8 @@ def _scan(
         angle = ray_casting.incidence(lidar, world, pose, hits=hits)
         factors = jnp.exp(noise_by_incidence * angle)
     if scanner is None:
-        return ray_casting.add_range_noise(key, lidar, scan, factors)
+        return ray_casting.add_range_noise(key, lidar, scan, factors, draws)
     std = jnp.asarray(scanner.range_std(scan.ranges)) * (1.0 if factors is None else factors)
     unit = lidar._replace(range_std=1.0)
-    return scanners.digitise(scanner, ray_casting.add_range_noise(key, unit, scan, std))
+    noisy = ray_casting.add_range_noise(key, unit, scan, std, draws)
+    return scanners.digitise(scanner, noisy)

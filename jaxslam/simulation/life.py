@@ -198,6 +198,7 @@ def scan_life(
     events: Events,
     pose: Array,
     time: Array,
+    draws: Array | None = None,
 ) -> Scan:
     """Scan of a world with all that is in it at a time.
 
@@ -210,6 +211,7 @@ def scan_life(
         events: What happens on this drive.
         pose: (3,) [m, m, rad] of the scanner in the world.
         time: () [s] since the first scan.
+        draws: (R,) standard normals of the ranges, instead of those of the key.
     """
     traffic, movers, crowd = life.traffic, life.movers, events.crowd
     discs = Discs(*people_at(crowd, traffic, movers, time, pose[:2]))
@@ -247,6 +249,5 @@ def scan_life(
     )
     is_wall = (surface >= 0) & (surface < len(walls))
     is_black = is_wall & events.black[jnp.clip(surface, 0, len(walls) - 1)]
-    return measure(
-        key, lidar, life.ranges, Returns(distance, angle, surface, is_black), scanner=scanner
-    )
+    returns = Returns(distance, angle, surface, is_black)
+    return measure(key, lidar, life.ranges, returns, scanner=scanner, draws=draws)

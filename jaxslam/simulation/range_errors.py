@@ -67,6 +67,7 @@ def measure(
     returns: Returns,
     *,
     scanner: Scanner | None = None,
+    draws: Array | None = None,
 ) -> Scan:
     """Scan of what the beams meet.
 
@@ -79,6 +80,7 @@ def measure(
         errors: Of its ranges.
         returns: What its beams meet.
         scanner: The scanner with its own noise, resolution and least range; None: those of `lidar`.
+        draws: (R,) standard normals of the noise, instead of those of the key.
     """
     of_noise, of_edges, of_missing = jax.random.split(key, 3)
     ranges = mix_edges(of_edges, lidar, errors.spot, returns)
@@ -88,7 +90,9 @@ def measure(
     own = errors.std_scale * jnp.asarray(own, safe.dtype)
     std = jnp.hypot(own, errors.std_per_range * safe)
     std = std * jnp.exp(errors.std_by_incidence * returns.incidence)
-    safe = round_to(safe + std * jax.random.normal(of_noise, safe.shape, safe.dtype), errors)
+    if draws is None:
+        draws = jax.random.normal(of_noise, safe.shape, safe.dtype)
+    safe = round_to(safe + std * draws, errors)
     is_seen = jax.random.uniform(of_missing, safe.shape, safe.dtype) >= errors.missing
     black_range = errors.black_range * jnp.cos(returns.incidence)
     is_seen &= ~returns.is_black | (returns.distance < black_range)

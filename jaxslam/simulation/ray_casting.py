@@ -128,7 +128,13 @@ def share_leaving(lidar: Lidar, world: World, poses: Array) -> Leaving:
     )
 
 
-def add_range_noise(key: Key, lidar: Lidar, scan: Scan, factors: Array | None = None) -> Scan:
+def add_range_noise(
+    key: Key,
+    lidar: Lidar,
+    scan: Scan,
+    factors: Array | None = None,
+    draws: Array | None = None,
+) -> Scan:
     """Add the range noise of the lidar to a scan; ranges beyond the largest become no return.
 
     Args:
@@ -136,8 +142,11 @@ def add_range_noise(key: Key, lidar: Lidar, scan: Scan, factors: Array | None = 
         lidar: The scanner.
         scan: Without noise.
         factors: (R,) on the standard deviation of each beam; None: 1.
+        draws: (R,) standard normals, instead of those of the key.
     """
-    noise = lidar.range_std * jax.random.normal(key, scan.ranges.shape, scan.ranges.dtype)
+    if draws is None:
+        draws = jax.random.normal(key, scan.ranges.shape, scan.ranges.dtype)
+    noise = lidar.range_std * draws
     if factors is not None:
         noise *= factors
     return to_scan(lidar, jnp.where(scan.hit, scan.ranges + noise, jnp.inf))

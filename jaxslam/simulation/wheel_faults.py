@@ -58,17 +58,25 @@ def draw_faults(key: Key, faults: WheelFaults, num_scans: int, dtype: Any) -> Fa
     """Draw the faults of a drive of T scans."""
     of_slip, of_share, of_carpet, of_carried, of_time = jax.random.split(key, 5)
     shape = (num_scans - 1, 2)
-    slips = jax.random.uniform(of_slip, shape, dtype) < faults.slip
-    # The square of a t with two degrees of freedom has the quantile 2 u^2 / (1 - u^2).
-    u = jax.random.uniform(of_share, shape, dtype, maxval=0.9999)
-    share = faults.slip_share * jnp.sqrt(2.0 * u**2 / (1.0 - u**2))
+    slip = slip_shares(
+        faults,
+        jax.random.uniform(of_slip, shape, dtype),
+        jax.random.uniform(of_share, shape, dtype, maxval=0.9999),
+    )
     happens = jax.random.uniform(of_carried, (), dtype) < faults.carried
     at = jax.random.randint(of_time, (), 0, max(num_scans - 1, 1), jnp.int32)
     return FaultDraws(
-        slip=jnp.where(slips, jnp.minimum(share, 1.0), 0.0),
+        slip=slip,
         carpet=of_carpet,
         carried_at=jnp.where(happens, at, -1),
     )
+
+
+def slip_shares(faults: WheelFaults, happens: Array, size: Array) -> Array:
+    """Share (...) of its motion that a wheel loses, by two uniform draws (...) in [0, 1)."""
+    # The square of a t with two degrees of freedom has the quantile 2 u^2 / (1 - u^2).
+    share = faults.slip_share * jnp.sqrt(2.0 * size**2 / (1.0 - size**2))
+    return jnp.where(happens < faults.slip, jnp.minimum(share, 1.0), 0.0)
 
 
 def slipped(
@@ -116,11 +124,20 @@ def fail_odometry(key: Key, faults: WheelFaults, odometry: Array) -> Array:
 
     While it fails it repeats its last increment, or reports none.
     """
-    of_start, of_end, of_kind = jax.random.split(key, 3)
-    count = len(odometry)
-    starts = jax.random.uniform(of_start, (count,), odometry.dtype) < faults.lost
-    ends = jax.random.uniform(of_end, (count,), odometry.dtype) * faults.lost_scans < 1.0
-    latches = jax.random.uniform(of_kind, (count,), odometry.dtype) < faults.latched
+    return fail_as_drawn(draw_failures(key, len(odometry), odometry.dtype), faults, odometry)
+
+
+def draw_failures(key: Key, num_scans: int, dtype: Any) -> Array:
+    """Uniform draws (T, 3): whether odometry fails at a scan, recovers, and how it fails."""
+    keys = jax.random.split(key, 3)
+    return jnp.stack([jax.random.uniform(own, (num_scans,), dtype) for own in keys], axis=1)
+
+
+def fail_as_drawn(draws: Array, faults: WheelFaults, odometry: Array) -> Array:
+    """`fail_odometry` by uniform draws (T, 3), those of `draw_failures`."""
+    starts = draws[:, 0] < faults.lost
+    ends = draws[:, 1] * faults.lost_scans < 1.0
+    latches = draws[:, 2] < faults.latched
 
     def body(state: tuple[Array, Array], now: Any) -> tuple[tuple[Array, Array], Array]:
         failing, repeated = state

@@ -1,7 +1,6 @@
 """What front end, scan matching and filter make of a drive, recorded or simulated, in numbers."""
 
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +22,7 @@ from jaxslam.filtering.kalman import innovation_cov
 from jaxslam.filtering.noise import NoiseParams, measurement_cov
 from jaxslam.filtering.step_info import StepInfo, degrees
 from jaxslam.frontend.lidar import beam_ends
-from jaxslam.matching.oriented_points import oriented_points, transform_points
+from jaxslam.matching.oriented_points import oriented_points
 from jaxslam.pipeline import log_input
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.results import SlamResult
@@ -33,27 +32,14 @@ from jaxslam.simulation.worlds import World, with_index
 KINDS = {"junctions": JUNCTION, "corners": CORNER, "walls": WALL}
 PAIR_GATE = 0.3  # [m] to the nearest point of the keyframe before, of a point that is compared
 ON_WALL = 0.3  # [m] from the map within which a range is of what the map has
-
-
-class MeasuredDrive(NamedTuple):
-    """A drive, mapped, and what was measured.
-
-    Attributes:
-        result: Of SLAM.
-        numbers: Measures by name.
-        residuals: (N,) [m] of ranges against a map, those of hits alone.
-    """
-
-    result: SlamResult
-    numbers: Numbers
-    residuals: np.ndarray
+HALF_PIECE = 5  # beams on either side of the middle of a piece of a wall
+MAX_ACROSS, MIN_COSINE = 0.08, 0.3  # [m] from its line; of the incidence, on a straight piece
 
 
 def run(log: LaserLog) -> tuple[Config, Scan, SlamResult]:
-    """Run SLAM on a log as `jaxslam run` does."""
+    """Run SLAM on a log as `jaxslam run` does; configuration, scans [T] and result."""
     given = log_input.from_laser_log(log)
-    result = log_input.run(given)
-    return given.config, jax.tree.map(np.asarray, given.scans), result
+    return given.config, jax.tree.map(np.asarray, given.scans), log_input.run(given)
 
 
 def feature_numbers(config: Config, result: SlamResult) -> Numbers:
@@ -115,74 +101,98 @@ def own_nis(
     rows = ekf.linearize(predicted, *chosen, linearisation=config.linearisation)
     S = innovation_cov(ekf.covariance_blocks(predicted), rows)
     S = jnp.stack([S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(order))])
-    v = rows.residual
-    det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
-    both = S[:, 1, 1] * v[:, 0] ** 2 + S[:, 0, 0] * v[:, 1] ** 2 - 2 * S[:, 0, 1] * v[:, 0] * v[:, 1]
-    one = v[:, 0] ** 2 / S[:, 0, 0]
-    square = jnp.where(degrees(chosen[0]) == 1, one, both / det)
+    (x, y), (xx, xy, yy) = rows.residual.T, (S[:, 0, 0], S[:, 0, 1], S[:, 1, 1])
+    both = (yy * x**2 + xx * y**2 - 2 * xy * x * y) / (xx * yy - xy**2)
+    square = jnp.where(degrees(chosen[0]) == 1, x**2 / xx, both)
     return jnp.zeros(len(slot), square.dtype).at[order].set(square)
 
 
 def alignment_numbers(lidar: Lidar, scans: Scan, result: SlamResult) -> Numbers:
-    """How well each keyframe lies on the one before, at the estimated poses.
+    """How well each keyframe is on the one before, at the estimated poses.
 
     Points within `PAIR_GATE` of a point of the keyframe before are compared with the line that this
-    one lies on; the residual is the distance from the line.
+    one is on: the residual is their distance from it.
     """
-    keyframes = result.keyframes
-    own = jax.tree.map(lambda x: jnp.asarray(x[keyframes]), scans)
-    surfaces = jax.tree.map(np.asarray, jax.jit(jax.vmap(partial(oriented_points, lidar)))(own))
-    ends = np.asarray(jax.jit(jax.vmap(partial(beam_ends, lidar)))(own))
-    poses, hit = result.poses[keyframes], np.asarray(own.hit)
-    residuals, compared, total = [], 0, 0
-    for k in range(1, len(keyframes)):
+    assert result.scan_matches is not None
+    own = jax.tree.map(lambda x: jnp.asarray(x[result.keyframes]), scans)
+    surfaces = jax.jit(jax.vmap(partial(oriented_points, lidar)))(own)
+    ends = np.asarray(jax.jit(jax.vmap(partial(beam_ends, lidar)))(own), np.float64)
+    surfaces = jax.tree.map(np.asarray, surfaces)
+    poses, hit = result.poses[result.keyframes], np.asarray(own.hit)
+    turns = np.column_stack([np.zeros((len(poses), 2)), poses[:, 2]])
+    residuals, total = [np.zeros(0)], 0
+    for k in range(1, len(poses)):
         valid = surfaces.valid[k - 1]
         if not valid.any() or not hit[k].any():
             continue
-        placed = transform_points(jnp.asarray(poses[k - 1]), jax.tree.map(lambda x: x[k - 1][valid], surfaces)) if False else None
         before = transform(poses[k - 1], surfaces.points[k - 1][valid])
-        turn = poses[k - 1, 2]
-        n = surfaces.normal[k - 1][valid]
-        normal = np.stack([np.cos(turn) * n[:, 0] - np.sin(turn) * n[:, 1], np.sin(turn) * n[:, 0] + np.cos(turn) * n[:, 1]], axis=1)
+        normal = transform(turns[k - 1], surfaces.normal[k - 1][valid])
         points = transform(poses[k], ends[k][hit[k]])
         distance, index = cKDTree(before).query(points, distance_upper_bound=PAIR_GATE)
         near = np.isfinite(distance)
         gap = points[near] - before[index[near]]
         residuals.append(np.abs(np.sum(gap * normal[index[near]], axis=1)))
-        compared += near.sum()
         total += len(points)
-    r = np.concatenate(residuals)
+    residual = np.concatenate(residuals)
     return {
-        "residual_rms_m": float(np.sqrt(np.mean(r**2))),
-        "residual_median_m": float(np.median(r)),
-        "residual_p90_m": float(np.percentile(r,90)),
-        "compared_share": compared / total,
+        "residual_median_m": float(np.median(residual)),
+        "residual_rms_m": float(np.sqrt(np.mean(residual**2))),
+        "compared": residual.size / max(total, 1),
         "inliers": float(np.mean(np.asarray(result.scan_matches.inlier_fraction)[1:])),
     }
 
 
 @partial(jax.jit, static_argnums=0)
 def expected_ranges(lidar: Lidar, world: World, poses: Array) -> Array:
+    """Ranges (T, R) [m] of a world from poses (T, 3), infinite where beams meet nothing."""
     return lax.map(lambda pose: find_hits(lidar, world, pose).distance, poses)
 
 
-def range_numbers(lidar: Lidar, scans: Scan, poses: np.ndarray, walls: np.ndarray) -> tuple[Numbers, np.ndarray]:
-    """Ranges against a map: noise, what is nearer or further than it has, what does not return."""
+def range_numbers(lidar: Lidar, scans: Scan, poses: np.ndarray, walls: np.ndarray) -> Numbers:
+    """Ranges against the walls (S, 4) [m] of a map: what is missing, nearer or farther than they.
+
+    Args:
+        lidar: The scanner.
+        scans: [T].
+        poses: (T, 3) [m, m, rad] in the map.
+        walls: (S, 4) [m].
+    """
     world = with_index(World(jnp.asarray(walls, float)), lidar.range_max)
     expected = np.asarray(expected_ranges(lidar, world, jnp.asarray(poses, float)))
-    hit = np.asarray(scans.hit)
-    ranges = np.asarray(scans.ranges)
-    meets = np.isfinite(expected)
-    r = np.where(hit & meets, ranges - np.where(meets, expected, 0.0), np.nan)
-    have = r[np.isfinite(r)]
-    near = have[np.abs(have) < ON_WALL]
-    numbers = {
-        "missing": float(1 - hit.mean()),
-        "missing_at_wall": float((~hit & meets).sum() / meets.sum()),
-        "returns_from_nowhere": float((hit & ~meets).sum() / hit.sum()),
-        "short": float((have < -ON_WALL).mean()),
-        "long": float((have > ON_WALL).mean()),
-        "range_mad_m": float(1.4826 * np.median(np.abs(near - np.median(near)))),
-        "range_sd_m": float(near.std()),
+    hit, meets = np.asarray(scans.hit), np.isfinite(expected)
+    both = hit & meets
+    error = (np.asarray(scans.ranges) - np.where(meets, expected, 0.0))[both]
+    near = error[np.abs(error) < ON_WALL]
+    return {
+        "missing": float(1.0 - hit.mean()),
+        "missing_at_wall": float((meets & ~hit).sum() / meets.sum()),
+        "short": float(np.mean(error < -ON_WALL)),
+        "long": float(np.mean(error > ON_WALL)),
+        "range_std_m": float(near.std()),
     }
-    return numbers, r
+
+
+def roughness(lidar: Lidar, ranges: np.ndarray) -> float:
+    """Median over straight pieces of walls of the standard deviation [m] of ranges (T, R) on them.
+
+    A piece is of 11 beams, all within 8 cm of their line; deviations are along the beams.
+    """
+    angles = lidar.angle_min + lidar.angle_increment * np.arange(lidar.num_beams)
+    beams = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = np.where(np.isfinite(ranges), ranges, np.nan).astype(np.float64)[..., None] * beams
+    found = []
+    for k in range(HALF_PIECE, lidar.num_beams - HALF_PIECE, HALF_PIECE):
+        piece = points[:, k - HALF_PIECE : k + HALF_PIECE + 1]
+        piece = piece[np.isfinite(piece).all(axis=(1, 2))]
+        offset = piece - piece.mean(axis=1, keepdims=True)
+        xx, xy, yy = (
+            np.mean(offset[..., i] * offset[..., j], axis=1) for i, j in ((0, 0), (0, 1), (1, 1))
+        )
+        direction = 0.5 * np.arctan2(2 * xy, xx - yy)
+        normal = np.stack([-np.sin(direction), np.cos(direction)], axis=-1)
+        across = np.einsum("tkj,tj->tk", offset, normal)
+        cosine = np.abs(normal @ beams[k])
+        good = (np.abs(across).max(axis=1) < MAX_ACROSS) & (cosine > MIN_COSINE)
+        std = np.sqrt(np.sum(across**2, axis=1) / (2 * HALF_PIECE - 1))
+        found.append(std[good] / cosine[good])
+    return float(np.median(np.concatenate(found)))

@@ -124,7 +124,7 @@ PROBABILITIES = {
     "traffic": ("standing", "carts", "closed"),
     "wheels": ("slip", "carpet", "lost", "latched", "dropped", "carried"),
 }
-POSITIVE = {"traffic": ("door_period",)}
+POSITIVE = {"traffic": ("door_period",), "ranges": ("shared_angle",)}
 AT_LEAST_ONE = {"wheels": ("lost_scans",)}
 ANY_SIGN = {"ranges": ("std_by_incidence",)}
 

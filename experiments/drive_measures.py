@@ -72,14 +72,16 @@ def nis_of_features(config: Config, result: SlamResult) -> tuple[np.ndarray, np.
         jnp.asarray(result.odometry, dtype), result.features, scan_match=result.scan_matches
     )
     params = NoiseParams.for_laser_log(match_scans=True)
-    nis, used = _nis_of_features(own, params, init(own, jnp.zeros(3, dtype)), measurements)
+    nis, used = nis_by_feature(own, params, init(own, jnp.zeros(3, dtype)), measurements)
     return np.asarray(nis), np.asarray(used)
 
 
 @partial(jax.jit, static_argnums=0)
-def _nis_of_features(
+def nis_by_feature(
     config: FilterConfig, params: NoiseParams, start: Belief, measurements: Measurement
 ) -> tuple[Array, Array]:
+    """Run the filter; `own_nis` (T, M) of all steps, and which features were used (T, M)."""
+
     def body(belief: Belief, now: Measurement) -> tuple[Belief, tuple[Array, Array]]:
         predicted, _ = slam_filter.predict(config, params, belief, now)
         belief, info = slam_filter.unchecked_step(config, params, belief, now)

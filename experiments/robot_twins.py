@@ -107,6 +107,7 @@ def fit_wheels(poses: np.ndarray, odom_poses: np.ndarray) -> Wheels:
     scaled = error / np.sqrt(np.maximum(rolled, MIN_TURN))
     std = HALF_NORMAL * float(np.median(scaled))
     turn, per_metre = factors.tolist()
+    turn = turn if 0.5 < turn < 2.0 else 1.0  # of a drive that hardly turns it is not known
     return Wheels(distance, turn, per_metre, std, float(np.mean(scaled > 3.0 * std)))
 
 

@@ -22,6 +22,7 @@ from jaxslam.frontend.lidar import to_scan
 from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
 from jaxslam.simulation.life import Events, Life, draw_events, scan_life
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.scan_motion import velocities
 from jaxslam.simulation.scanners import Scanner
 from jaxslam.simulation.worlds import World
 
@@ -236,11 +237,11 @@ def _drive(
     times = robot.scan_period * jnp.arange(num_scans, dtype=truth.dtype)
 
     def living(item: tuple) -> Scan:
-        pose, own, time, is_kept = item
-        scan = scan_life(own, lidar, robot.scanner, world, life, events, pose, time)
+        pose, own, time, is_kept, velocity = item
+        scan = scan_life(own, lidar, robot.scanner, world, life, events, pose, time, velocity)
         return to_scan(lidar, jnp.where(is_kept & scan.hit, scan.ranges, jnp.inf))
 
-    return living, (truth, keys, times, kept), odometry
+    return living, (truth, keys, times, kept, velocities(truth, times)), odometry
 
 
 def _scan(

@@ -94,8 +94,13 @@ def walls_of(lidar: Lidar, poses: np.ndarray, scans: Scan) -> np.ndarray:
 
 
 def fit_wheels(poses: np.ndarray, odom_poses: np.ndarray) -> Wheels:
-    """How the odometry of T scans differs from poses (T, 3), by medians and robust regression."""
+    """How the odometry of T scans differs from poses (T, 3), by medians and robust regression.
+
+    Steps from or to a pose that is not finite are left out.
+    """
     true, read = increments(poses)[1:], increments(odom_poses)[1:]
+    known = np.isfinite(true).all(axis=1)
+    true, read = true[known], read[known]
     moves = np.abs(read[:, 0]) > MIN_TURN
     distance = float(np.median(true[moves, 0] / read[moves, 0])) if moves.any() else 1.0
     given, weight = read[:, [2, 0]], np.ones(len(read))

@@ -28,9 +28,9 @@ from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation import log_errors, trajectory
 from jaxslam.io.errors import InputError
-from jaxslam.simulation import typical_life as life_numbers
+from jaxslam.simulation import life_defaults
 from jaxslam.simulation.life import Life, life_in
-from jaxslam.simulation.typical_life import typical_life
+from jaxslam.simulation.life_defaults import typical_life
 
 NAME = "truth_to_life"
 LOGS = ("intel", "aces", "freiburg-101", "mit-csail")
@@ -47,10 +47,13 @@ ASKED["shared_std"] = ("residual_median_m", 2)
 def measure(log: LaserLog) -> tuple[Numbers, np.ndarray, np.ndarray]:
     """Map a log; its measures, estimated poses (T, 3) and the walls (S, 4) [m] of its map."""
     config, scans, result = drive_measures.run(log)
-    numbers = drive_measures.feature_numbers(config, result)
+    mapped = np.isfinite(result.poses).all(axis=1)
+    numbers: Numbers = {"mapped": float(mapped.mean())}
+    numbers |= drive_measures.feature_numbers(config, result)
     numbers |= drive_measures.alignment_numbers(log.lidar, scans, result)
     walls = robot_twins.walls_of(log.lidar, result.poses, scans)
-    numbers |= drive_measures.range_numbers(log.lidar, scans, result.poses, walls)
+    own = jax.tree.map(lambda x: x[mapped], scans)
+    numbers |= drive_measures.range_numbers(log.lidar, own, result.poses[mapped], walls)
     numbers["roughness_m"] = drive_measures.roughness(log.lidar, log.ranges)
     wheels = robot_twins.fit_wheels(result.poses, log.odom_poses)
     numbers["turn_outliers"] = wheels.outliers
@@ -63,8 +66,8 @@ def life_of(twin: Twin, variant: str, asked: Numbers) -> Life:
     if variant in ("ideal", "scan time"):
         return life_in(twin.world, path, max_people=MAX_PEOPLE)
     own = {name: value for name, value in asked.items() if name != "people_per_metre"}
-    ranges = life_numbers.RANGES._replace(**own)
-    density = asked.get("people_per_metre", life_numbers.PEOPLE_PER_METRE)
+    ranges = life_defaults.RANGES._replace(**own)
+    density = asked.get("people_per_metre", life_defaults.PEOPLE_PER_METRE)
     return typical_life(
         twin.world, path, people_per_metre=density, ranges=ranges, max_people=MAX_PEOPLE
     )
@@ -78,8 +81,8 @@ def simulate(key: jax.Array, twin: Twin, variant: str, asked: Numbers) -> Number
         robot = robot._replace(scanner=scanner)
     log = robot_twins.simulate(key, twin._replace(robot=robot), life_of(twin, variant, asked))
     numbers, poses, _ = measure(log)
-    stamps = np.arange(len(poses))
-    error = trajectory.ate(stamps, poses, stamps, twin.poses)["ate_rmse_m"]
+    stamps = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    error = trajectory.ate(stamps, poses[stamps], stamps, twin.poses[stamps])["ate_rmse_m"]
     return numbers | {"ate_rmse_m": float(error)}
 
 
@@ -92,6 +95,8 @@ class Recorded:
 
     def _map(self) -> Numbers:
         numbers, poses, walls = measure(self.log.laser_log)
+        if not np.isfinite(poses).all():
+            raise InputError("its scans are not all in one map", field=self.log.name)
         self._twin = robot_twins.twin_of(self.log.name, self.log.laser_log, poses, walls)
         found = log_errors.errors_against(
             self.log.laser_log, poses, self.log.reference, self.log.relations
@@ -129,9 +134,9 @@ def asked_for(recorded: Numbers, base: Numbers, typical: Numbers) -> Numbers:
         typical: Of the twin with typical life.
     """
     used = {
-        "people_per_metre": life_numbers.PEOPLE_PER_METRE,
-        "black": life_numbers.RANGES.black,
-        "shared_std": life_numbers.RANGES.shared_std,
+        "people_per_metre": life_defaults.PEOPLE_PER_METRE,
+        "black": life_defaults.RANGES.black,
+        "shared_std": life_defaults.RANGES.shared_std,
     }
     found: Numbers = {}
     for name, (measure, power) in ASKED.items():

@@ -11,7 +11,7 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import dead_reckoning, increments
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import init
-from jaxslam.simulation import typical_life
+from jaxslam.simulation import life_defaults
 from jaxslam.simulation.scanners import pieces
 from tests.landmark_drives import CONFIG, PARAMS, drive
 
@@ -114,9 +114,9 @@ def test_what_is_asked_for_is_on_the_line_between_both_simulations():
     typical = {"short": 0.03, "missing_at_wall": 0.04, "residual_median_m": 0.005}
     log = {"short": 0.02, "missing_at_wall": 0.06, "residual_median_m": np.sqrt(17e-6)}
     found = truth_to_life.asked_for(log, base, typical)
-    assert found["people_per_metre"] == pytest.approx(typical_life.PEOPLE_PER_METRE / 2)
-    assert found["black"] == pytest.approx(1.5 * typical_life.RANGES.black)
-    assert found["shared_std"] == pytest.approx(typical_life.RANGES.shared_std / np.sqrt(2))
+    assert found["people_per_metre"] == pytest.approx(life_defaults.PEOPLE_PER_METRE / 2)
+    assert found["black"] == pytest.approx(1.5 * life_defaults.RANGES.black)
+    assert found["shared_std"] == pytest.approx(life_defaults.RANGES.shared_std / np.sqrt(2))
     assert truth_to_life.asked_for(base, base, typical)["black"] == 0.0
 
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxslam.simulation import World, densify
 from jaxslam.simulation.life import draw_events
-from jaxslam.simulation.typical_life import (
+from jaxslam.simulation.life_defaults import (
     CARTS,
     PEOPLE_PER_METRE,
     RANGES,

@@ -91,7 +91,8 @@ class Recorded:
 
     def __init__(self, log: Log, cache: common.ResultCache):
         """The log; what was computed before is in the cache."""
-        self.log, self._cache, self._twin = log, cache, None
+        self.log, self._cache = log, cache
+        self._twin: Twin | None = None
 
     def _map(self) -> Numbers:
         numbers, poses, walls = measure(self.log.laser_log)

@@ -6,9 +6,11 @@ from jaxslam.simulation.drives import drive as drive
 from jaxslam.simulation.drives import num_scans_of_drive as num_scans_of_drive
 from jaxslam.simulation.drives import simulate_scans as simulate_scans
 from jaxslam.simulation.floor_plans import floor_plan as floor_plan
+from jaxslam.simulation.given_poses import simulate_at_poses as simulate_at_poses
 from jaxslam.simulation.kinematics import noise_params as noise_params
 from jaxslam.simulation.life import Life as Life
 from jaxslam.simulation.life import life_in as life_in
+from jaxslam.simulation.life_defaults import typical_life as typical_life
 from jaxslam.simulation.path_following import densify as densify
 from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
 from jaxslam.simulation.patrols import patrol as patrol

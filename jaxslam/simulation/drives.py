@@ -22,6 +22,7 @@ from jaxslam.frontend.lidar import to_scan
 from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
 from jaxslam.simulation.life import Events, Life, draw_events, scan_life
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.scan_motion import velocities
 from jaxslam.simulation.scanners import Scanner
 from jaxslam.simulation.worlds import World
 
@@ -310,12 +311,13 @@ def drive_and_scan(
     times = robot.scan_period * jnp.arange(len(truth), dtype=truth.dtype)
 
     def living(item: tuple) -> Scan:
-        pose, own, normals, time, is_kept = item
-        given = lidar, robot.scanner, world, life, events, pose, time, normals
+        pose, own, normals, time, is_kept, velocity = item
+        given = lidar, robot.scanner, world, life, events, pose, time, normals, velocity
         scan = scan_life(own, *given)
         return to_scan(lidar, jnp.where(is_kept & scan.hit, scan.ranges, jnp.inf))
 
-    return living, (truth, keys, ranges, times, draws.kept), odometry
+    items = truth, keys, ranges, times, draws.kept, velocities(truth, times)
+    return living, items, odometry
 
 
 def _scan(

@@ -19,6 +19,7 @@ from jaxslam.simulation.discs import Discs
 from jaxslam.simulation.nearest_walls import nearest_walls
 from jaxslam.simulation.range_errors import RangeErrors, Returns, measure
 from jaxslam.simulation.ray_casting import Hits
+from jaxslam.simulation.scan_motion import Seen, look_in_motion
 from jaxslam.simulation.scanners import Scanner
 from jaxslam.simulation.traffic import (
     Crowd,
@@ -123,7 +124,7 @@ PROBABILITIES = {
     "traffic": ("standing", "carts", "closed"),
     "wheels": ("slip", "carpet", "lost", "latched", "dropped", "carried"),
 }
-POSITIVE = {"traffic": ("door_period",)}
+POSITIVE = {"traffic": ("door_period",), "ranges": ("shared_angle",)}
 AT_LEAST_ONE = {"wheels": ("lost_scans",)}
 ANY_SIGN = {"ranges": ("std_by_incidence",)}
 
@@ -199,6 +200,7 @@ def scan_life(
     pose: Array,
     time: Array,
     draws: Array | None = None,
+    velocity: Array | None = None,
 ) -> Scan:
     """Scan of a world with all that is in it at a time.
 
@@ -212,13 +214,14 @@ def scan_life(
         pose: (3,) [m, m, rad] of the scanner in the world.
         time: () [s] since the first scan.
         draws: (R,) standard normals of the ranges, instead of those of the key.
+        velocity: (3,) [m/s, m/s, rad/s] of the scanner in its own frame; None: it stands still.
     """
     traffic, movers, crowd = life.traffic, life.movers, events.crowd
     discs = Discs(*people_at(crowd, traffic, movers, time, pose[:2]))
     moved = World(moved_walls(crowd, traffic, movers, time, pose[:2]))
     walls = jnp.asarray(world.walls)
 
-    def look(world: World) -> tuple[Array, Array, Array]:
+    def look(world: World, pose: Array) -> Seen:
         """Distance, incidence and surface (R,) of what the beams meet."""
         hits = ray_casting.find_hits(lidar, world, pose, discs)
         angle = ray_casting.incidence(lidar, world, pose, discs=discs, hits=hits)
@@ -235,18 +238,23 @@ def scan_life(
             jnp.where(nearer, len(walls) + len(discs.radius) + wall, surface),
         )
 
-    def see_through(seen: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def see_through(pose: Array, seen: Seen) -> Seen:
         start = jnp.concatenate([walls[:, :2], walls[:, :2]], axis=1)
-        behind = look(world._replace(walls=jnp.where(events.glass[:, None], start, walls)))
+        behind = look(world._replace(walls=jnp.where(events.glass[:, None], start, walls)), pose)
         is_wall = (seen[2] >= 0) & (seen[2] < len(walls))
         is_glass = is_wall & events.glass[jnp.clip(seen[2], 0, len(walls) - 1)]
         passes = is_glass & (seen[1] > life.ranges.glass_angle)
         return jax.tree.map(partial(jnp.where, passes), behind, seen)
 
-    seen = look(world)
-    distance, angle, surface = jax.lax.cond(
-        jnp.any(events.glass), see_through, lambda seen: seen, seen
-    )
+    def see(pose: Array) -> Seen:
+        seen = look(world, pose)
+        through = partial(see_through, pose)
+        return jax.lax.cond(jnp.any(events.glass), through, lambda seen: seen, seen)
+
+    if velocity is None or scanner is None or scanner.turn_time is None:
+        distance, angle, surface = see(pose)
+    else:
+        distance, angle, surface = look_in_motion(see, scanner, pose, velocity)
     is_wall = (surface >= 0) & (surface < len(walls))
     is_black = is_wall & events.black[jnp.clip(surface, 0, len(walls) - 1)]
     returns = Returns(distance, angle, surface, is_black)

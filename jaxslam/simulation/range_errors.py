@@ -12,6 +12,8 @@ from jaxslam.frontend.lidar import to_scan
 from jaxslam.simulation import scanners
 from jaxslam.simulation.scanners import Scanner
 
+SHARED = 3  # number of the key of the error that neighbours share
+
 
 class RangeErrors(NamedTuple):
     """Errors of ranges beside those of the scanner; numbers, traced under jit, none by default.
@@ -21,6 +23,9 @@ class RangeErrors(NamedTuple):
         std_per_range: [-] further part of it that grows in proportion to the range.
         std_by_incidence: [1 / rad] by which the logarithm of the standard deviation grows with the
             angle between a beam and the normal of the wall.
+        shared_std: [m] standard deviation of an error that beams share with their neighbours: of
+            walls that are not flat or not upright, of materials, of the scanner itself.
+        shared_angle: [rad] between beams over which their correlation falls to 1 / e, above 0.
         resolution: [m] step to which ranges are rounded, 0 for none.
         spot: [rad] angle that the spot of a beam covers: where it covers an edge the range is the
             mean over what it meets, weighted by the angle.
@@ -35,6 +40,8 @@ class RangeErrors(NamedTuple):
     std_scale: Any = 1.0
     std_per_range: Any = 0.0
     std_by_incidence: Any = 0.0
+    shared_std: Any = 0.0
+    shared_angle: Any = 0.07
     resolution: Any = 0.0
     spot: Any = 0.0
     missing: Any = 0.0
@@ -92,12 +99,30 @@ def measure(
     std = std * jnp.exp(errors.std_by_incidence * returns.incidence)
     if draws is None:
         draws = jax.random.normal(of_noise, safe.shape, safe.dtype)
-    safe = round_to(safe + std * draws, errors)
+    shared = shared_error(jax.random.fold_in(key, SHARED), lidar, errors, safe.dtype)
+    safe = round_to(safe + std * draws + shared, errors)
     is_seen = jax.random.uniform(of_missing, safe.shape, safe.dtype) >= errors.missing
     black_range = errors.black_range * jnp.cos(returns.incidence)
     is_seen &= ~returns.is_black | (returns.distance < black_range)
     scan = to_scan(lidar, jnp.where(has_return & is_seen, safe, jnp.inf))
     return scan if scanner is None else scanners.digitise(scanner, scan)
+
+
+def shared_error(key: Key, lidar: Lidar, errors: RangeErrors, dtype: Any) -> Array:
+    """Error (R,) [m] that neighbouring beams share: a Gauss-Markov process along the beams.
+
+    With r = exp(-increment / angle) and standard normals n, s_i = r s_(i-1) + sqrt(1 - r^2) n_i.
+    """
+    draws = jax.random.normal(key, (lidar.num_beams,), dtype)
+    decay = jnp.exp(-lidar.angle_increment / jnp.asarray(errors.shared_angle, dtype))
+    fresh = jnp.sqrt(1.0 - decay**2) * draws
+    fresh = fresh.at[0].set(draws[0])
+
+    def join(first: tuple[Array, Array], then: tuple[Array, Array]) -> tuple[Array, Array]:
+        return first[0] * then[0], first[1] * then[0] + then[1]
+
+    decays = jnp.full_like(draws, decay)
+    return errors.shared_std * lax.associative_scan(join, (decays, fresh))[1]
 
 
 def round_to(ranges: Array, errors: RangeErrors) -> Array:

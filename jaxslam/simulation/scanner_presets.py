@@ -138,6 +138,8 @@ _PRESETS = (
         range_min=0.0,  # [ST]
         range_max=8.192,  # in millimetres [PL]
         range_resolution=0.001,  # [PL]
+        turn_time=1 / 75,  # [ST]
+        num_turns=2,  # [ST]
         notes=("a serial line of 38400 baud carries 5 of its 37.5 scans a second",),  # [PL]
     ),
     Scanner(

@@ -64,6 +64,9 @@ class Scanner(NamedTuple):
         range_resolution: [m] ranges are multiples of it; None: not rounded.
         beam_divergence: [rad] full angle by which a beam widens.
         beam_width: [m] width of a beam where it leaves the scanner.
+        turn_time: [s] in which its mirror turns once: on a robot that moves, in `Life`, the beams
+            of a scan are of different poses; None: all are of one.
+        num_turns: Turns that a scan is put together of: beam i is of turn i mod `num_turns`.
         notes: What was assumed or chosen where sources say nothing or disagree.
         error_notes: Likewise, of its errors.
     """
@@ -81,6 +84,8 @@ class Scanner(NamedTuple):
     range_resolution: float | None = None
     beam_divergence: float | None = None
     beam_width: float | None = None
+    turn_time: float | None = None
+    num_turns: int = 1
     notes: tuple[str, ...] = ()
     error_notes: tuple[str, ...] = ()
 
@@ -176,7 +181,9 @@ def check_scanner(scanner: Any) -> None:
             f"scanner.range_min is {scanner.range_min}, not in [0, range_max), "
             f"and range_max is {scanner.range_max}"
         )
-    for name in ("range_resolution", "beam_divergence", "beam_width"):
+    if scanner.num_turns < 1 or scanner.num_turns != int(scanner.num_turns):
+        raise ValueError(f"scanner.num_turns is {scanner.num_turns}, not an integer of 1 or more")
+    for name in ("range_resolution", "beam_divergence", "beam_width", "turn_time"):
         value = getattr(scanner, name)
         if value is not None and not 0.0 < as_float64(f"scanner.{name}", value, ()) < math.inf:
             raise ValueError(f"scanner.{name} is {value}, not above 0")

@@ -114,3 +114,17 @@ def test_no_edge_no_spot_and_no_return_change_nothing():
             ).sum()
         )(0.03)
     assert slope == 0.0
+
+
+def test_neighbours_share_an_error_that_falls_off_along_the_beams():
+    """Its covariance over k beams is std^2 exp(-k increment / angle)."""
+    exact = returns_of(jnp.full(40, 5.0))
+    errors = RangeErrors(std_scale=0.0, shared_std=0.03, shared_angle=0.05)
+    error = np.asarray(scans(errors, COUNT, exact).ranges) - 5.0
+    for lag in (0, 1, 3, 10):
+        product = error[:, lag:] * error[:, : 40 - lag]
+        by_scan = product.mean(axis=1)  # scans are independent
+        wanted = 0.03**2 * np.exp(-lag * 0.02 / 0.05)
+        assert abs(by_scan.mean() - wanted) < 4.5 * by_scan.std() / np.sqrt(COUNT)
+    none = np.asarray(scans(RangeErrors(std_scale=0.0), 5, exact).ranges)
+    np.testing.assert_allclose(none, 5.0, atol=1e-12)

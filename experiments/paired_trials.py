@@ -118,7 +118,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     axis.set_yticks(at, [row["name"] for row in rows])
     axis.invert_yaxis()
     axis.set(xlim=(0, 1.15), xlabel="standard error of the difference: paired / unpaired trials")
-    axis.legend(loc="upper left", fontsize=8)
+    axis.legend(loc="upper right", fontsize=8)
     axis.grid(axis="x", alpha=0.3)
     figure.savefig(path)
 

@@ -143,9 +143,10 @@ def simulate(
             "seconds": seconds,
         }
         about = key, config, params, simulated, walls, points
-        true_poses, result = trials_module.replay_trial(
-            *about, trial=0, num_scans=num_scans, life=given
-        )
+        with name_errors(f"{'the drive' if life is None else life}: trial 0"):
+            true_poses, result = trials_module.replay_trial(
+                *about, trial=0, num_scans=num_scans, life=given
+            )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)
         tum.write(out_dir / "trajectory.tum", stamps, result.poses)

@@ -77,11 +77,11 @@ def test_a_wrong_file_is_one_line_and_nothing_is_written(text, message, tmp_path
 def test_simulate_says_what_goes_wrong_and_makes_it_happen(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "p.csv").write_text("1.0,0.9\n2.2,0.9\n")
-    (tmp_path / "life.toml").write_text("dropped = 1.0\npeople = 2\n")
+    (tmp_path / "life.toml").write_text("missing = 0.98\npeople = 2\n")
     call = ["simulate", "--path", "p.csv", "--trials", "2", "--out", "o"]
     assert main.main([*call, "--life", "life.toml"]) == 0
     said = capsys.readouterr().out
-    assert "life: dropped 1, people 2\n" in said and "of the beams along the drive leave" in said
+    assert "life: missing 0.98, people 2\n" in said and "of the beams along the drive leave" in said
     numbers = json.loads((tmp_path / "o" / "metrics.json").read_text())
-    assert numbers["matches"] == 0.0 and numbers["landmarks"] == 0.0  # no scan has arrived
+    assert numbers["matches"] == 0.0 and numbers["landmarks"] == 0.0  # of seven beams
     assert numbers["beams_leaving"]["no_wall"] == 0.0

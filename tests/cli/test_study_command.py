@@ -5,8 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from jaxslam.cli import main, study_variants
+from jaxslam.cli import main, study_command, study_variants
+from jaxslam.io.errors import InputError
 from jaxslam.study import kept_trials, runner, study_file
+from jaxslam.study.kept_trials import Collected
+from jaxslam.study.processes import Group, LostProcessError
 
 SMALL = """
 trials = 5
@@ -123,6 +126,30 @@ def test_a_file_of_life_is_that_of_simulate(folder, capsys):
 )
 def test_processes_that_do_not_fit_are_one_line(folder, options, message, capsys):
     assert message in said_of(folder, '[base]\npath = "p.csv"\n', capsys, *options)
+
+
+def test_several_processes_keep_trials_that_this_one_reads(tmp_path, monkeypatch):
+    group = Group("127.0.0.1:1", 3, (0, 1))
+    said = []
+    monkeypatch.setattr(study_command.runner, "in_numpy", lambda one: one)
+    monkeypatch.setattr(
+        study_command.processes_module,
+        "run_group",
+        lambda group, work, *given: said.append((work, given)) or [700.0, 600.0],
+    )
+    kept = [Collected("record", 1.0, 500.0)]
+    monkeypatch.setattr(study_command, "work", lambda *given: kept)
+    found = study_command._run(["variant"], 4, 7, tmp_path, group)
+    assert found == [Collected("record", 1.0, 1300.0)]  # the memory of both
+    assert said == [(study_command._share, (["variant"], 4, 7, tmp_path))]
+    assert study_command._run(["variant"], 4, 7, tmp_path, group._replace(own=(2,))) is None
+
+    def lost(*_):
+        raise LostProcessError("process 1 of 3 ended early")
+
+    monkeypatch.setattr(study_command.processes_module, "run_group", lost)
+    with pytest.raises(InputError, match="process 1 of 3 ended early"):
+        study_command._run(["variant"], 4, 7, tmp_path, group)
 
 
 @pytest.mark.slow

@@ -1,16 +1,12 @@
 """The experiment of many drives: on several processes, stopped and resumed."""
 
 import json
-import multiprocessing
 import os
-import re
-import signal
 import subprocess
 import sys
-import tempfile
 from functools import cache
 from io import StringIO
-from time import monotonic, sleep
+from time import monotonic
 
 import jax
 import numpy as np
@@ -70,34 +66,6 @@ def done(tmp_path_factory):
     return monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO()), folder
 
 
-def hello(text, stream):
-    """Work that needs no compiler."""
-    import jax
-
-    stream.write(f"this is process {jax.process_index()}\n")
-    return f"{text} {jax.process_index()} of {jax.process_count()}"
-
-
-def die(who, how, stream):
-    """Work at which process `who` ends early, and the others wait for it."""
-    import jax
-    from jax.experimental import multihost_utils
-
-    if jax.process_index() == who:
-        if how == "refuse":
-            raise InputError("is bad", field="--this")
-        if how == "raise":
-            raise ValueError("nothing to\nsee")
-        os.kill(os.getpid(), signal.SIGKILL)
-    multihost_utils.process_allgather(np.ones(2))
-
-
-def left_over(pid):
-    """Processes that process `pid` has started."""
-    line = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
-    return line.stdout.split()
-
-
 @pytest.mark.timeout(300)
 @pytest.mark.slow
 def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypatch):
@@ -111,37 +79,6 @@ def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypa
     with np.load(one) as one, np.load(two) as two:
         for name in TrialResult._fields:
             np.testing.assert_array_equal(one[name], two[name])
-
-
-@pytest.mark.timeout(120)
-def test_each_process_returns_what_it_found(capfd):
-    assert processes.run_group(processes.local(2), hello, "I am") == ["I am 0 of 2", "I am 1 of 2"]
-    assert capfd.readouterr().err == "this is process 0\n"
-
-
-@pytest.mark.timeout(120)
-@pytest.mark.parametrize(
-    "who, how, kind, line",
-    [
-        (1, "kill", processes.LostProcessError, "process 1 of 2 ended early (exit code -9)"),
-        (0, "kill", processes.LostProcessError, "process 0 of 2 ended early (exit code -9)"),
-        (
-            1,
-            "raise",
-            processes.LostProcessError,
-            "process 1 of 2 ended early (ValueError: nothing to)",
-        ),
-        (0, "refuse", InputError, "--this: is bad"),
-    ],
-)
-def test_a_process_that_ends_early_ends_all(who, how, kind, line, tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    begin = monotonic()
-    with pytest.raises(kind, match=re.escape(line)):
-        processes.run_group(processes.local(2), die, who, how)
-    assert monotonic() - begin < 60
-    assert not multiprocessing.active_children()
-    assert any(tmp_path.iterdir()) is (kind is processes.LostProcessError)  # what it printed
 
 
 @pytest.mark.timeout(120)
@@ -161,33 +98,6 @@ def test_a_process_that_is_missing_is_reported_in_one_line(number, tmp_path):
     assert done.returncode == 2 and monotonic() - begin < 60
     (line,) = done.stderr.splitlines()
     assert line.startswith("monte_carlo: error: not all of 2 processes came up at 127.0.0.1")
-
-
-@pytest.mark.timeout(120)
-@pytest.mark.slow
-def test_no_process_outlives_the_one_that_started_it(tmp_path):
-    code = "from jaxslam.study import processes; from tests.experiments import test_monte_carlo; "
-    code += "processes.run_group(processes.local(2), test_monte_carlo.idle)"
-    own = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    parent = subprocess.Popen([sys.executable, "-c", code], env=own, stderr=subprocess.PIPE)
-    try:
-        assert parent.stderr.readline() == b"idle\n"
-        started = left_over(parent.pid)
-        assert len(started) >= 2
-    finally:
-        parent.kill()
-        parent.communicate()
-    end = monotonic() + 20
-    while monotonic() < end and any(os.path.exists(f"/proc/{pid}/exe") for pid in started):
-        sleep(0.1)
-    assert not [pid for pid in started if os.path.exists(f"/proc/{pid}/exe")]
-
-
-def idle(stream):
-    """Work that does not end."""
-    stream.write("idle\n")
-    stream.flush()
-    sleep(600)
 
 
 @pytest.mark.parametrize(

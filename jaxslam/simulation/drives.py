@@ -311,8 +311,8 @@ def drive_and_scan(
 
     def living(item: tuple) -> Scan:
         pose, own, normals, time, is_kept = item
-        given = lidar, robot.scanner, world, life, events, pose, time, normals
-        scan = scan_life(own, *given)
+        given = lidar, robot.scanner, world, life, events, pose, time
+        scan = scan_life(own, *given, draws=normals)
         return to_scan(lidar, jnp.where(is_kept & scan.hit, scan.ranges, jnp.inf))
 
     return living, (truth, keys, ranges, times, draws.kept), odometry

@@ -198,6 +198,7 @@ def scan_life(
     events: Events,
     pose: Array,
     time: Array,
+    *,
     draws: Array | None = None,
 ) -> Scan:
     """Scan of a world with all that is in it at a time.

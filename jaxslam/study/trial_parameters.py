@@ -274,5 +274,5 @@ def _first(data: TrialNoise) -> TrialNoise:
     return jax.tree.map(lambda x: x[0], data)
 
 
-_ERRORS = DeviceMap(_errors, size=1, static=5)
-_GRADIENTS = DeviceMap(_gradients, size=1, static=5)
+_ERRORS = DeviceMap(_errors, size=1, static=5, compile_quickly=True)
+_GRADIENTS = DeviceMap(_gradients, size=1, static=5, compile_quickly=True)

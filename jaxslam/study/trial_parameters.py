@@ -193,7 +193,7 @@ def _errors(
     def simulate(one: TrialNoise) -> Episode:
         own = _change(names, changes, common, with_keys(one, key_type))
         world = frontend, robot, common.world, common.path
-        more = {"life": own.life, "mount_error": own.mount_error}
+        more: dict[str, Any] = {"life": own.life, "mount_error": own.mount_error}
         episode = simulate_from_noise(own.noise, *world, **more)
         kept = keeps(own.scan_period, len(one.scans))
         restrict = jax.vmap(lambda own, kept: restrict_features(own, kept & own.valid))

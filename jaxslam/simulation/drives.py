@@ -31,6 +31,20 @@ LIFE = 1  # number of the key of what goes wrong, of that of a drive
 MAX_DEPARTURE = 0.5  # [m] from its path, of a robot that cannot turn on the spot
 
 
+class LifeDraws(NamedTuple):
+    """What goes wrong on a drive of T scans, drawn.
+
+    Attributes:
+        events: What happens on this drive.
+        failures: (T, 3) uniform draws of the odometry's failures.
+        kept: (T,) bool, which scans are not lost.
+    """
+
+    events: Events
+    failures: Array
+    kept: Array
+
+
 class Draws(NamedTuple):
     """All that is random on a drive of T scans, drawn.
 
@@ -38,17 +52,13 @@ class Draws(NamedTuple):
         wheels: (T - 1, SUBSTEPS, D) standard normals of the encoders.
         scans: (T,) keys of the scans.
         ranges: (T, R) standard normals of the ranges; None: those of the keys.
-        events: What happens on this drive; None: nothing.
-        failures: (T, 3) uniform draws of the odometry's failures; None: it does not fail.
-        kept: (T,) bool, which scans are not lost; None: none is.
+        life: What goes wrong; None: nothing.
     """
 
     wheels: Array
     scans: Key
     ranges: Array | None = None
-    events: Events | None = None
-    failures: Array | None = None
-    kept: Array | None = None
+    life: LifeDraws | None = None
 
 
 def start_pose(path: Array) -> Array:
@@ -260,11 +270,12 @@ def _drive(
     )
     if life is not None:
         of_events, of_odometry, of_scans = jax.random.split(jax.random.fold_in(key, LIFE), 3)
-        draws = draws._replace(
+        drawn = LifeDraws(
             events=draw_events(of_events, life, num_scans),
             failures=wheel_faults.draw_failures(of_odometry, num_scans, path.dtype),
             kept=wheel_faults.keeps_scan(of_scans, life.wheels, num_scans, path.dtype),
         )
+        draws = draws._replace(life=drawn)
     given = lidar, robot, world, path
     return drive_and_scan(draws, *given, noise_by_incidence=noise_by_incidence, life=life)
 
@@ -283,7 +294,7 @@ def drive_and_scan(
     """A drive whose scans are still to be made.
 
     Args:
-        draws: All that is random; `events`, `failures` and `kept` only with `life`.
+        draws: All that is random, with that of `life`, if there is one.
         lidar: The scanner as the front end knows it.
         robot: The robot.
         world: The walls.
@@ -296,27 +307,33 @@ def drive_and_scan(
     Returns:
         A function that makes a scan of an item; the items [T], of which the first is the true pose
         (T, 3); and odometry increments (T, 3).
+
+    Raises:
+        ValueError: There is life without its draws, or draws without life; while tracing.
     """
-    events, keys, ranges = draws.events, draws.scans, draws.ranges
+    if (life is None) != (draws.life is None):
+        raise ValueError("one of life and draws.life is None; give both or none")
+    keys, ranges, drawn = draws.scans, draws.ranges, draws.life
+    events = None if drawn is None else drawn.events
     truth, odometry = drive_as_drawn(draws.wheels, robot, path, life=life, events=events)
     if mount_error is not None:
         truth = jax.vmap(compose, in_axes=(0, None))(truth, mount_error)
-    if life is None:
+    if life is None or drawn is None:
         scan = partial(
             _scan, lidar, world, noise_by_incidence=noise_by_incidence, scanner=robot.scanner
         )
         return (lambda item: scan(*item)), (truth, keys, ranges), odometry
 
-    odometry = wheel_faults.fail_as_drawn(draws.failures, life.wheels, odometry)
+    odometry = wheel_faults.fail_as_drawn(drawn.failures, life.wheels, odometry)
     times = robot.scan_period * jnp.arange(len(truth), dtype=truth.dtype)
 
     def living(item: tuple) -> Scan:
         pose, own, normals, time, is_kept, velocity = item
-        given = lidar, robot.scanner, world, life, events, pose, time, normals, velocity
+        given = lidar, robot.scanner, world, life, drawn.events, pose, time, normals, velocity
         scan = scan_life(own, *given)
         return to_scan(lidar, jnp.where(is_kept & scan.hit, scan.ranges, jnp.inf))
 
-    items = truth, keys, ranges, times, draws.kept, velocities(truth, times)
+    items = truth, keys, ranges, times, drawn.kept, velocities(truth, times)
     return living, items, odometry
 
 

@@ -199,6 +199,7 @@ def scan_life(
     events: Events,
     pose: Array,
     time: Array,
+    *,
     draws: Array | None = None,
     velocity: Array | None = None,
 ) -> Scan:

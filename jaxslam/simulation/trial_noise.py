@@ -20,7 +20,7 @@ from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.simulation import drives, kinematics, wheel_faults
-from jaxslam.simulation.drives import SUBSTEPS, Draws
+from jaxslam.simulation.drives import SUBSTEPS, Draws, LifeDraws
 from jaxslam.simulation.life import Life, draw_events
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
@@ -71,9 +71,11 @@ def draws_of(noise: TrialNoise, life: Life | None) -> Draws:
     events = draw_events(noise.start, life, count)
     slip = wheel_faults.slip_shares(life.wheels, drawn[1:, :2], 0.9999 * drawn[1:, 2:4])
     return draws._replace(
-        events=events._replace(faults=events.faults._replace(slip=slip)),
-        failures=drawn[:, 4:7],
-        kept=drawn[:, 7] >= life.wheels.dropped,
+        life=LifeDraws(
+            events=events._replace(faults=events.faults._replace(slip=slip)),
+            failures=drawn[:, 4:7],
+            kept=drawn[:, 7] >= life.wheels.dropped,
+        )
     )
 
 

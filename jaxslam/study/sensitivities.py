@@ -7,10 +7,10 @@ All values of a parameter are tried on the same noise, trial by trial:
     paired differences    (e(t + h) - e(t - h)) / (2 h),  its mean and standard error over trials
 
 with the step h that has the least sum of squares of standard error and bias; the bias of a central
-difference, C h^2, is known from that of twice the step. A gradient has no step, but where data
-association switches with a parameter the error jumps, of which a gradient knows nothing. So each
-is compared with paired differences on the same trials, and where they differ by more than
-`AGREEMENT` standard errors the differences are what counts.
+difference, C h^2, or of a one-sided one, C h, is known from that of twice the step. A gradient has
+no step, but where data association switches with a parameter the error jumps, of which a gradient
+knows nothing. So each is compared with paired differences on the same trials, and where they differ
+by more than `AGREEMENT` standard errors the differences are what counts.
 
 References:
     Asmussen, Glynn (2007), "Stochastic simulation", chapter VII: finite differences with common
@@ -45,6 +45,8 @@ class Parameter(NamedTuple):
         is_log: Whether it is changed by a factor, exp(change); else the change is added.
         step: Least change that is tried.
         has_gradient: Whether errors may be differentiable with respect to it.
+        one_sided: Whether only changes above 0 are possible: differences are then one-sided, and
+            the effect is that of twice the parameter.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Parameter(NamedTuple):
     is_log: bool = True
     step: float = 0.05
     has_gradient: bool = False
+    one_sided: bool = False
 
 
 class Estimate(NamedTuple):
@@ -72,10 +75,10 @@ class Sensitivity(NamedTuple):
         paired: By paired differences.
         gradient: By gradient; None where there is none.
         distance: [-] of the gradient from the paired differences, in standard errors of the
-            difference; None where there is no gradient.
+            difference, with the bias of the step; None where there is no gradient.
         step: Of the paired differences.
-        halved: Change of the logarithm of the RMSE if the parameter is halved; None where it is not
-            changed by a factor.
+        halved: Change of the logarithm of the RMSE if the parameter is halved, or doubled where
+            differences are one-sided; None where it is not changed by a factor.
         trials: That count.
         left_out: Those that diverged, or were not finite, at one of the values.
     """
@@ -137,9 +140,16 @@ def sensitivities(
 
 
 def ranked(found: Sequence[Sensitivity]) -> list[Sensitivity]:
-    """Those that have an effect of halving, the most helpful first: what to improve first."""
-    own = [one for one in found if one.halved is not None]
-    return sorted(own, key=lambda one: one.halved.mean if one.halved else 0.0)
+    """Those that have an effect of halving, or doubling, the largest first: what to improve first.
+
+    Of a parameter that is doubled, as the period of the scans, the error would fall by as much.
+    """
+
+    def gain(one: Sensitivity) -> float:
+        mean = one.halved.mean if one.halved else 0.0
+        return mean if one.parameter.one_sided else -mean
+
+    return sorted((one for one in found if one.halved is not None), key=gain, reverse=True)
 
 
 def describe(one: Sensitivity) -> str:
@@ -150,7 +160,8 @@ def describe(one: Sensitivity) -> str:
     text = text or f"{one.parameter.name}: {amount} per {by}"
     if one.halved is not None:
         factor, error = np.exp(one.halved.mean), one.halved.standard_error
-        text += f", halved {factor:.3f} +- {factor * error:.2g} times the error"
+        change = "doubled" if one.parameter.one_sided else "halved"
+        text += f", {change} {factor:.3f} +- {factor * error:.2g} times the error"
     return f"{text}; by {one.method}, {one.trials} trials, {one.left_out} left out"
 
 
@@ -176,8 +187,11 @@ def _sensitivity(
 ) -> Sensitivity:
     """Sensitivity to one parameter, from errors (N,) at a change of it, and derivatives (N,)."""
     sizes = own.step * np.array(STEPS)
-    differences = [(errors(h) - errors(-h)) / (2 * h) for h in sizes]
-    best = _best_step(own.name, sizes, differences)
+    if own.one_sided:
+        differences = [(errors(h) - errors(0.0)) / h for h in sizes]
+    else:
+        differences = [(errors(h) - errors(-h)) / (2 * h) for h in sizes]
+    best, bias = _best_step(own.name, differences, order=1 if own.one_sided else 2)
     step, difference = float(sizes[best]), differences[best]
     paired = derivative = mean_of(difference, own.name)
     method, gradient, distance = PAIRED, None, None
@@ -186,12 +200,13 @@ def _sensitivity(
         counts &= np.isfinite(slope)
         gradient = mean_of(np.where(counts, slope, np.nan), own.name)
         gap = mean_of(slope - difference, own.name)
-        distance = abs(gap.mean) / max(gap.standard_error, TINY)
+        distance = abs(gap.mean) / max(float(np.hypot(gap.standard_error, bias)), TINY)
         if distance <= AGREEMENT:
             method, derivative = GRADIENT, gradient
     halved = None
     if own.is_log:
-        halved = mean_of(errors(-np.log(2.0)) - errors(0.0), own.name)
+        factor = 2.0 if own.one_sided else 0.5
+        halved = mean_of(errors(np.log(factor)) - errors(0.0), own.name)
     trials = int(counts.sum())
     return Sensitivity(
         own,
@@ -207,16 +222,16 @@ def _sensitivity(
     )
 
 
-def _best_step(name: str, sizes: np.ndarray, differences: list[np.ndarray]) -> int:
-    """Number of the step whose standard error and bias have the least sum of squares.
+def _best_step(name: str, differences: list[np.ndarray], order: int) -> tuple[int, float]:
+    """Number of the step whose standard error and bias have the least sum of squares; its bias.
 
-    Each step is twice the one before, and the bias of the last four times that of the one before.
+    Each step is twice the one before, and its bias 2^order times as large.
     """
-    bias = []
-    for fine, coarse in zip(differences[:-1], differences[1:], strict=True):
-        gap = mean_of(coarse - fine, name)
-        # What may be chance is none.
-        bias.append(np.sqrt(max(gap.mean**2 - gap.standard_error**2, 0.0)) / 3)
-    bias.append(4 * bias[-1])
+    gaps = [mean_of(b - a, name) for a, b in zip(differences[:-1], differences[1:], strict=True)]
+    # What may be chance is none.
+    known = [np.sqrt(max(gap.mean**2 - gap.standard_error**2, 0.0)) for gap in gaps]
+    bias = [gap / (2**order - 1) for gap in known]
+    bias.append(2**order * bias[-1])
     variance = [mean_of(one, name).standard_error ** 2 for one in differences]
-    return int(np.argmin(np.square(bias) + variance))
+    best = int(np.argmin(np.square(bias) + variance))
+    return best, float(bias[best])

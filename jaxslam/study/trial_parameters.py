@@ -6,6 +6,7 @@ the errors of the features fixed, as they are in the frame of the scanner, and d
 them the features move with the scanner.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from jax import lax
 
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode
-from jaxslam.core.features import Features
+from jaxslam.core.features import Features, restrict_features
 from jaxslam.core.se2 import relative, rotation, wrap_angle, wrap_direction
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering.config import FilterConfig
@@ -42,12 +43,13 @@ FILTER = (
 )
 LIFE: dict[str, Any] = {"ranges": RangeErrors, "traffic": Traffic, "wheels": WheelFaults}
 NAMES = (
-    *("encoder_noise", "range_noise"),
+    *("encoder_noise", "range_noise", "scan_period"),
     *MOUNT,
     *(f"filter.{name}" for name in FILTER),
     "life.PART.FIELD",
 )
-"""Known parameters: the noise of the encoders and of the ranges; the pose of the scanner on the
+"""Known parameters: the noise of the encoders and of the ranges; the period of the scans, which is
+only made longer, by scans that are left out of the same drive; the pose of the scanner on the
 robot, that its user does not know; the noise that the filter assumes; any number of `Life`, such as
 `life.ranges.missing`."""
 
@@ -108,8 +110,12 @@ def parameter_of(variant: Variant, name: str) -> Parameter:
     if name == "encoder_noise":
         found = Parameter(name, robot.encoder_noise, "m / sqrt(m)", has_gradient=True)
     elif name == "range_noise":
-        value = (lidar.range_std, "m") if robot.scanner is None else (1.0, "that of the scanner")
-        found = Parameter(name, *value)
+        found = Parameter(name, lidar.range_std, "m")
+        if robot.scanner is not None:
+            found = Parameter(name, 1.0, "that of the scanner")
+    elif name == "scan_period":
+        step = math.log(2.0) / 2
+        found = Parameter(name, robot.scan_period, "s", step=step, one_sided=True)
     elif kind == "filter" and rest in FILTER:
         value = float(np.max(np.asarray(getattr(variant.params, rest))))
         found = Parameter(name, value, "as of NoiseParams", has_gradient=True)
@@ -132,18 +138,19 @@ def _is_of_life(name: str) -> bool:
 
 
 class _Changed(NamedTuple):
-    """What changed parameters make of a trial."""
+    """What changed parameters make of a trial; the period of scans is that of how many times."""
 
     noise: TrialNoise
     params: NoiseParams
     life: Life | None
     mount_error: Array
+    scan_period: Array
 
 
 def _change(names: tuple[str, ...], changes: Array, common: Common, noise: TrialNoise) -> _Changed:
     """Noise and parameters of a trial with changes (P,)."""
     params, life = common.params, common.life
-    mount = [jnp.zeros_like(changes[0])] * 3
+    mount, period = [jnp.zeros_like(changes[0])] * 3, jnp.ones_like(changes[0])
     for name, change in zip(names, changes, strict=True):
         kind, _, rest = name.partition(".")
         factor = jnp.exp(change)
@@ -153,6 +160,8 @@ def _change(names: tuple[str, ...], changes: Array, common: Common, noise: Trial
             noise = noise._replace(wheels=noise.wheels * factor)
         elif name == "range_noise":
             noise = noise._replace(ranges=noise.ranges * factor)
+        elif name == "scan_period":
+            period = factor
         elif kind == "filter":
             params = params._replace(**{rest: getattr(params, rest) * factor})
         elif life is not None:
@@ -160,7 +169,7 @@ def _change(names: tuple[str, ...], changes: Array, common: Common, noise: Trial
             own = getattr(life, part)
             changed = own._replace(**{field: getattr(own, field) * factor})
             life = life._replace(**{part: changed})
-    return _Changed(noise, params, life, jnp.stack(mount))
+    return _Changed(noise, params, life, jnp.stack(mount), period)
 
 
 def log_rmse(result: TrialResult) -> Array:
@@ -184,7 +193,11 @@ def _errors(
     def simulate(one: TrialNoise) -> Episode:
         own = _change(names, changes, common, with_keys(one, key_type))
         world = frontend, robot, common.world, common.path
-        return simulate_from_noise(own.noise, *world, life=own.life, mount_error=own.mount_error)
+        more: dict[str, Any] = {"life": own.life, "mount_error": own.mount_error}
+        episode = simulate_from_noise(own.noise, *world, **more)
+        kept = keeps(own.scan_period, len(one.scans))
+        restrict = jax.vmap(lambda own, kept: restrict_features(own, kept & own.valid))
+        return episode._replace(features=restrict(episode.features, kept))
 
     params = _change(names, changes, common, with_keys(_first(data), key_type)).params
     result = filter_batch(config, params, lax.map(simulate, data))
@@ -228,6 +241,12 @@ def _gradients(
     return jax.vmap(one_gradient)(data, lax.map(simulate, data))
 
 
+def keeps(period: Array, num_scans: int) -> Array:
+    """Which of T scans (T,) bool are made if their period is 1 or more times as long."""
+    passed = jnp.arange(-1, num_scans, dtype=period.dtype) / period
+    return jnp.diff(jnp.floor(passed + 1e-4)) > 0.0
+
+
 def seen_from(pose: Array, seen_at: Array, features: Features) -> Features:
     """Features of a scan as from another pose, with the same errors in the frame of the world.
 
@@ -255,5 +274,5 @@ def _first(data: TrialNoise) -> TrialNoise:
     return jax.tree.map(lambda x: x[0], data)
 
 
-_ERRORS = DeviceMap(_errors, size=1, static=5)
-_GRADIENTS = DeviceMap(_gradients, size=1, static=5)
+_ERRORS = DeviceMap(_errors, size=1, static=5, compile_quickly=True)
+_GRADIENTS = DeviceMap(_gradients, size=1, static=5, compile_quickly=True)

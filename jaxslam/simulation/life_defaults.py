@@ -20,7 +20,7 @@ RANGES = RangeErrors(shared_std=0.006, spot=0.0015, missing=0.0003, black=0.04)
 PEOPLE_PER_METRE = 0.013
 """[1 / m] of the walkway, of which metres that are driven again do not count."""
 CARTS = 0.1
-WHEELS = WheelFaults(slip=0.05, slip_share=0.1)
+WHEELS = WheelFaults(slip=0.06, slip_share=0.05)
 
 
 def typical_life(

@@ -1,8 +1,8 @@
 """What goes wrong on a usual drive: one set of numbers, from four recorded logs.
 
-`experiments.truth_to_life` compares the logs with their simulated twins and prints the numbers that
-each of them asks for; these are about their medians. What a data sheet gives is not among them:
-the noise, resolution and turn time of the scanner are its own (`Scanner`).
+`experiments.truth_to_life` compares the logs with their simulated counterparts and prints what each
+of them asks for; these are about the medians. What a data sheet gives is not among them: noise,
+resolution and turn time of a scanner are its own (`Scanner`).
 """
 
 from typing import Any

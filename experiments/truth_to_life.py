@@ -1,9 +1,10 @@
 """Simulated robots against recorded ones: how true to life a simulation is.
 
-Each of four logs in the folder `--data` has a twin: its map as the building, its estimated poses as
-the true ones, its scanner, and wheels with the errors of its odometry. Log and twin are mapped by
+Each of four logs in the folder `--data` has a counterpart: its map as the building, its estimated
+poses as the true ones, its scanner, and wheels with the errors of its odometry. Both are mapped by
 the same pipeline and measured alike: features and matches a scan, innovations, alignment of scans,
-ranges against their own map. Rows are the twin's measures by the log's, for three simulations:
+ranges against their own map. Rows have the measures of the counterpart by those of the log, for
+three simulations:
 
     ideal      nothing goes wrong, and a scan takes no time
     scan time  the beams of a scan are measured one after the other while the robot moves
@@ -20,10 +21,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments import common, drive_measures, log_folder, real_logs, robot_twins
+from experiments import common, counterparts, drive_measures, log_folder, real_logs
 from experiments.common import Numbers
+from experiments.counterparts import Counterpart
 from experiments.log_folder import Log
-from experiments.robot_twins import Twin
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.logs import LaserLog
 from jaxslam.evaluation import log_errors, trajectory
@@ -51,54 +52,58 @@ def measure(log: LaserLog) -> tuple[Numbers, np.ndarray, np.ndarray]:
     numbers: Numbers = {"mapped": float(mapped.mean())}
     numbers |= drive_measures.feature_numbers(config, result)
     numbers |= drive_measures.alignment_numbers(log.lidar, scans, result)
-    walls = robot_twins.walls_of(log.lidar, result.poses, scans)
+    walls = counterparts.walls_of(log.lidar, result.poses, scans)
     own = jax.tree.map(lambda x: x[mapped], scans)
     numbers |= drive_measures.range_numbers(log.lidar, own, result.poses[mapped], walls)
     numbers["roughness_m"] = drive_measures.roughness(log.lidar, log.ranges)
-    wheels = robot_twins.fit_wheels(result.poses, log.odom_poses)
+    wheels = counterparts.fit_wheels(result.poses, log.odom_poses)
     numbers["turn_outliers"] = wheels.outliers
     return numbers, result.poses, walls
 
 
-def life_of(twin: Twin, variant: str, asked: Numbers) -> Life:
+def life_of(counterpart: Counterpart, variant: str, asked: Numbers) -> Life:
     """What goes wrong in a variant, with what is asked for in place of the typical numbers."""
-    path = robot_twins.path_of(twin.poses)
+    path = counterparts.path_of(counterpart.poses)
     if variant in ("ideal", "scan time"):
-        return life_in(twin.world, path, max_people=MAX_PEOPLE)
+        return life_in(counterpart.world, path, max_people=MAX_PEOPLE)
     own = {name: value for name, value in asked.items() if name != "people_per_metre"}
     ranges = life_defaults.RANGES._replace(**own)
     density = asked.get("people_per_metre", life_defaults.PEOPLE_PER_METRE)
     return typical_life(
-        twin.world, path, people_per_metre=density, ranges=ranges, max_people=MAX_PEOPLE
+        counterpart.world, path, people_per_metre=density, ranges=ranges, max_people=MAX_PEOPLE
     )
 
 
-def simulate(key: jax.Array, twin: Twin, variant: str, asked: Numbers) -> Numbers:
-    """Measures of a simulated drive of the twin."""
-    robot = twin.robot
+def simulate(key: jax.Array, counterpart: Counterpart, variant: str, asked: Numbers) -> Numbers:
+    """Measures of a simulated drive of the counterpart."""
+    robot = counterpart.robot
     if variant == "ideal" and robot.scanner is not None:
         scanner = robot.scanner._replace(turn_time=None, num_turns=1)
         robot = robot._replace(scanner=scanner)
-    log = robot_twins.simulate(key, twin._replace(robot=robot), life_of(twin, variant, asked))
+    log = counterparts.simulate(
+        key, counterpart._replace(robot=robot), life_of(counterpart, variant, asked)
+    )
     numbers, poses, _ = measure(log)
     stamps = np.flatnonzero(np.isfinite(poses).all(axis=1))
-    error = trajectory.ate(stamps, poses[stamps], stamps, twin.poses[stamps])["ate_rmse_m"]
+    error = trajectory.ate(stamps, poses[stamps], stamps, counterpart.poses[stamps])["ate_rmse_m"]
     return numbers | {"ate_rmse_m": float(error)}
 
 
 class Recorded:
-    """A log and its twin, which is made when it is first needed."""
+    """A log and its counterpart, which is made when it is first needed."""
 
     def __init__(self, log: Log, cache: common.ResultCache):
         """The log; what was computed before is in the cache."""
         self.log, self._cache = log, cache
-        self._twin: Twin | None = None
+        self._counterpart: Counterpart | None = None
 
     def _map(self) -> Numbers:
         numbers, poses, walls = measure(self.log.laser_log)
         if not np.isfinite(poses).all():
             raise InputError("its scans are not all in one map", field=self.log.name)
-        self._twin = robot_twins.twin_of(self.log.name, self.log.laser_log, poses, walls)
+        self._counterpart = counterparts.counterpart_of(
+            self.log.name, self.log.laser_log, poses, walls
+        )
         found = log_errors.errors_against(
             self.log.laser_log, poses, self.log.reference, self.log.relations
         )
@@ -110,29 +115,29 @@ class Recorded:
         """Measures of the log."""
         return self._cache(f"{self.log.name} recorded", self._map)
 
-    def twin(self) -> Twin:
-        """The twin."""
-        if self._twin is None:
+    def counterpart(self) -> Counterpart:
+        """The counterpart."""
+        if self._counterpart is None:
             self._map()
-        assert self._twin is not None
-        return self._twin
+        assert self._counterpart is not None
+        return self._counterpart
 
     def simulated(self, seed: int, variant: str, asked: Numbers) -> Numbers:
-        """Measures of the twin."""
+        """Measures of the counterpart."""
         key = jax.random.key(seed)
         return self._cache(
             f"{self.log.name} {variant}",
-            lambda: simulate(key, self.twin(), variant, asked),
+            lambda: simulate(key, self.counterpart(), variant, asked),
         )
 
 
 def asked_for(recorded: Numbers, base: Numbers, typical: Numbers) -> Numbers:
-    """The numbers of life with which the twin would measure as the log, at least 0.
+    """The numbers of life with which the counterpart would measure as the log, at least 0.
 
     Args:
         recorded: Measures of the log.
-        base: Of the twin with the time of its scans.
-        typical: Of the twin with typical life.
+        base: Of the counterpart with the time of its scans.
+        typical: Of the counterpart with typical life.
     """
     used = {
         "people_per_metre": life_defaults.PEOPLE_PER_METRE,
@@ -157,7 +162,7 @@ def ratios(simulated: Numbers, recorded: Numbers) -> Numbers:
 
 
 def compute(logs: list[Log], seed: int, left_out: bool, cache: common.ResultCache) -> Numbers:
-    """Measures of all logs and of their twins, ratios, and what each log asks for."""
+    """Measures of all logs and of their counterparts, ratios, and what each log asks for."""
     rows, asked = [], {}
     recordings = {log.name: Recorded(log, cache) for log in logs}
     for name, own in recordings.items():

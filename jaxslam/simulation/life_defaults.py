@@ -1,8 +1,8 @@
 """What goes wrong on a usual drive: one set of numbers, from four recorded logs.
 
-`experiments.truth_to_life` compares the logs with their simulated twins and prints the numbers that
-each of them asks for; these are about their medians. What a data sheet gives is not among them:
-the noise, resolution and turn time of the scanner are its own (`Scanner`).
+`experiments.truth_to_life` compares the logs with their simulated counterparts and prints what each
+of them asks for; these are about the medians. What a data sheet gives is not among them: noise,
+resolution and turn time of a scanner are its own (`Scanner`).
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ RANGES = RangeErrors(shared_std=0.006, spot=0.0015, missing=0.0003, black=0.04)
 PEOPLE_PER_METRE = 0.013
 """[1 / m] of the walkway, of which metres that are driven again do not count."""
 CARTS = 0.1
-WHEELS = WheelFaults(slip=0.05, slip_share=0.1)
+WHEELS = WheelFaults(slip=0.06, slip_share=0.05)
 
 
 def typical_life(

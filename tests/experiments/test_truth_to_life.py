@@ -1,11 +1,11 @@
-"""Measures of drives and twins of robots, each against what it must be."""
+"""Measures of drives and counterparts of robots, each against what it must be."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import drive_measures, robot_twins, truth_to_life
+from experiments import counterparts, drive_measures, truth_to_life
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2_np import dead_reckoning, increments
@@ -71,37 +71,41 @@ def test_the_errors_of_wheels_are_found():
     read = np.column_stack(
         [np.full(count, 0.5), np.zeros(count), rng.choice([0.0, 0.2, -0.2], count)]
     )
-    rolled = 0.5 + robot_twins.WHEEL_BASE / 2 * np.abs(read[:, 2])
+    rolled = 0.5 + counterparts.WHEEL_BASE / 2 * np.abs(read[:, 2])
     turn = 1.05 * read[:, 2] + 0.03 * read[:, 0]
     turn += std * np.sqrt(rolled) * rng.normal(size=count)
     turn[::20] += 0.5
     true = np.column_stack([1.02 * read[:, 0], np.zeros(count), turn])
     zero = np.zeros((1, 3))
     poses, odom = (dead_reckoning(zero[0], np.vstack([zero, x])) for x in (true, read))
-    wheels = robot_twins.fit_wheels(poses, odom)
+    wheels = counterparts.fit_wheels(poses, odom)
     assert wheels.distance == pytest.approx(1.02, abs=1e-6)
     assert wheels.turn == pytest.approx(1.05, abs=0.02)
     assert wheels.turn_per_metre == pytest.approx(0.03, abs=0.01)
     assert wheels.turn_std == pytest.approx(std, rel=0.12)
     assert wheels.outliers == pytest.approx(0.05, abs=0.01)
-    robot = robot_twins.robot_of(robot_twins.scanner_of("hall", LIDAR), wheels._replace(outliers=0))
+    robot = counterparts.robot_of(
+        counterparts.scanner_of("hall", LIDAR), wheels._replace(outliers=0)
+    )
     assert robot.encoder_noise * 2**0.5 / robot.wheel_base == pytest.approx(wheels.turn_std)
 
 
-def test_a_twin_without_errors_drives_and_scans_as_the_log():
-    """Poses along arcs past the wall: the twin's odometry and ranges are those of the log."""
+def test_a_counterpart_without_errors_drives_and_scans_as_the_log():
+    """Ahead to the wall, with exact wheels and ranges: its odometry and ranges are the log's."""
     steps = np.tile([0.1, 0.0, 0.0], (12, 1)) * np.r_[0.0, np.ones(11)][:, None]
     poses = dead_reckoning(np.zeros(3), steps)
     times = 0.5 * np.arange(12)
     ranges = wall_ranges(12)
     log = LaserLog.from_arrays(times, poses, ranges, LIDAR)
-    twin = robot_twins.twin_of("hall", log, poses, WALLS)
-    np.testing.assert_allclose(twin.velocities[1:-1], np.tile([0.2, 0, 0], (10, 1)), atol=1e-9)
-    scanner = twin.robot.scanner
+    counterpart = counterparts.counterpart_of("hall", log, poses, WALLS)
+    np.testing.assert_allclose(
+        counterpart.velocities[1:-1], np.tile([0.2, 0, 0], (10, 1)), atol=1e-9
+    )
+    scanner = counterpart.robot.scanner
     assert scanner.turn_time == 1 / 75 and scanner.num_turns == 1
     quiet = scanner._replace(range_noise=pieces((0.0, 0.0, 0.0)), turn_time=None)
-    robot = twin.robot._replace(scanner=quiet, encoder_noise=0.0)
-    found = robot_twins.simulate(jax.random.key(0), twin._replace(robot=robot), None)
+    robot = counterpart.robot._replace(scanner=quiet, encoder_noise=0.0)
+    found = counterparts.simulate(jax.random.key(0), counterpart._replace(robot=robot), None)
     np.testing.assert_allclose(increments(found.odom_poses), increments(poses), atol=1e-9)
     middle = slice(40, 141)
     error = found.ranges[0, middle] - ranges[0, middle]

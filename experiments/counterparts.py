@@ -1,4 +1,4 @@
-"""The simulated twin of a recorded robot: its building, drive, scanner and wheels."""
+"""The simulated counterpart of a recorded robot: its building, drive, scanner and wheels."""
 
 from typing import NamedTuple
 
@@ -48,7 +48,7 @@ class Wheels(NamedTuple):
     outliers: float
 
 
-class Twin(NamedTuple):
+class Counterpart(NamedTuple):
     """What is simulated in place of a recorded drive of T scans.
 
     Attributes:
@@ -150,8 +150,8 @@ def velocities_of(log: LaserLog, poses: np.ndarray) -> np.ndarray:
     return relative(at(times - SPEED_SPAN), at(times + SPEED_SPAN)) / (2.0 * SPEED_SPAN)
 
 
-def twin_of(name: str, log: LaserLog, poses: np.ndarray, walls: np.ndarray) -> Twin:
-    """The twin of a log that has been mapped.
+def counterpart_of(name: str, log: LaserLog, poses: np.ndarray, walls: np.ndarray) -> Counterpart:
+    """The counterpart of a log that has been mapped.
 
     Args:
         name: Of the log.
@@ -161,7 +161,7 @@ def twin_of(name: str, log: LaserLog, poses: np.ndarray, walls: np.ndarray) -> T
     """
     robot = robot_of(scanner_of(name, log.lidar), fit_wheels(poses, log.odom_poses))
     times = np.maximum.accumulate(log.times)
-    return Twin(log.lidar, robot, World(walls), poses, times, velocities_of(log, poses))
+    return Counterpart(log.lidar, robot, World(walls), poses, times, velocities_of(log, poses))
 
 
 def path_of(poses: np.ndarray, spacing: float = 0.3) -> np.ndarray:
@@ -173,18 +173,18 @@ def path_of(poses: np.ndarray, spacing: float = 0.3) -> np.ndarray:
     return poses[kept, :2]
 
 
-def simulate(key: jax.Array, twin: Twin, life: Life | None) -> LaserLog:
-    """The log of a simulated drive of the twin."""
+def simulate(key: jax.Array, counterpart: Counterpart, life: Life | None) -> LaserLog:
+    """The log of a simulated drive of the counterpart."""
     odometry, scans = simulate_at_poses(
         key,
-        twin.lidar,
-        twin.robot,
-        twin.world,
-        twin.poses,
-        times=twin.times - twin.times[0],
-        velocities=twin.velocities,
+        counterpart.lidar,
+        counterpart.robot,
+        counterpart.world,
+        counterpart.poses,
+        times=counterpart.times - counterpart.times[0],
+        velocities=counterpart.velocities,
         life=life,
     )
     ranges = np.where(np.asarray(scans.hit), np.asarray(scans.ranges), np.inf)
     poses = dead_reckoning(np.zeros(3), np.asarray(odometry, np.float64))
-    return LaserLog.from_arrays(twin.times, poses, ranges, twin.lidar)
+    return LaserLog.from_arrays(counterpart.times, poses, ranges, counterpart.lidar)

@@ -31,7 +31,7 @@ from jaxslam.frontend import extract
 from jaxslam.mapping import arc_table, graph_arcs, routes, topological_map
 from jaxslam.mapping.arc_table import ArcTable
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import drives, path_following, ray_casting
+from jaxslam.simulation import drive_draws, drives, path_following, ray_casting
 from jaxslam.simulation.robot import Robot, true_increment
 from jaxslam.simulation.worlds import World
 
@@ -90,7 +90,7 @@ def leg(
         encoder_key, scan_key = jax.random.split(key)
         command, index = path_following.pure_pursuit(path, index, belief.pose)
         command = jnp.where(moves, command, 0.0)
-        draws = jax.random.normal(encoder_key, (drives.SUBSTEPS, 2), path.dtype)
+        draws = jax.random.normal(encoder_key, (drive_draws.SUBSTEPS, 2), path.dtype)
         truth = compose(truth, true_increment(robot, draws, command))
         scan = ray_casting.add_range_noise(scan_key, lidar, ray_casting.cast(lidar, world, truth))
         features, local_arcs = extract.extract_local_graph(CONFIG.frontend, scan)

@@ -4,7 +4,7 @@ What may go wrong is a record of numbers, `Life`, and of what may move, `Movers`
 one drive is drawn once, at its start (`Events`); so a scan depends on its time and place alone.
 """
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -153,7 +153,13 @@ def material_groups(walls: AnyArray) -> np.ndarray:
     The two faces of a wall, parallel and at most `MAX_WALL` apart over half of the shorter one, are
     of the same piece; so are those of all walls that follow from one another like this.
     """
-    segments = np.asarray(walls, np.float64)
+    return _material_groups(np.asarray(walls, np.float64).tobytes())
+
+
+@lru_cache(maxsize=8)
+def _material_groups(walls: bytes) -> np.ndarray:
+    """`material_groups` of walls whose numbers are given as bytes; not to be changed."""
+    segments = np.frombuffer(walls).reshape(-1, 4)
     along = segments[:, 2:] - segments[:, :2]
     length = np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)
     unit = along / length[:, None]
@@ -168,8 +174,11 @@ def material_groups(walls: AnyArray) -> np.ndarray:
         near &= shared >= np.minimum(length[k], length[k + 1 :]) / 2
         pairs += [(k, k + 1 + other) for other in np.flatnonzero(near).tolist()]
     first, second = np.array(pairs or np.zeros((0, 2), int)).T
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(walls), len(walls)))
-    return csgraph.connected_components(graph, directed=False)[1].astype(np.int32)
+    shape = len(segments), len(segments)
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=shape)
+    groups = csgraph.connected_components(graph, directed=False)[1].astype(np.int32)
+    groups.setflags(write=False)
+    return groups
 
 
 def draw_events(key: Key, life: Life, num_scans: int) -> Events:

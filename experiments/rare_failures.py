@@ -1,26 +1,32 @@
 """Probability of a rare failure: multilevel splitting beside plain trials of the same drive.
 
-A robot with a small scanner drives ten scans through the paper's room. It fails if its position is
-ever more than `--threshold` metres off. Multilevel splitting (`study.rare_failures`) estimates how
-often, again and again with new noise; plain trials count it. `relative_error` is the standard error
-by the probability; `distance` that of the two estimates, in standard errors of their difference;
-`trials_ratio` the plain trials by those of one splitting; `plain_trials` how many plain ones would
-determine the probability as well. The same command resumes where it was stopped.
+`--drive landmarks`: twenty steps past known landmarks (`landmark_drive`), where errors grow little
+by little. `--drive scans`: ten scans of a small scanner in the paper's room, through the whole
+front end, where some large errors come at once, without a score that rises before. A drive fails if
+its position is ever more than `--threshold` metres off. Multilevel splitting
+(`study.rare_failures`) estimates how often, again and again with new noise; plain trials count it.
+`relative_error` is the standard error by the probability; `distance` that of the two estimates, in
+standard errors of their difference; `trials_ratio` the plain trials by those of one splitting;
+`plain_trials` how many plain ones would determine the probability as well; `mean` is that of the
+repetitions. The same command resumes where it was stopped.
 """
 
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from experiments import common
+from experiments import common, landmark_drive
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.devices import use_cpu_devices
 from jaxslam.core.scan import Lidar
+from jaxslam.core.types import Key
 from jaxslam.evaluation.trial_statistics import proportion
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
@@ -31,6 +37,7 @@ from jaxslam.frontend.segments import SegmentSpec
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import path_following, worlds
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.trials import trial_keys
 from jaxslam.study.rare_failures import RareFailure, describe, rare_failure
 from jaxslam.study.runner import Variant
 from jaxslam.study.trials_from_noise import TrialsFromNoise
@@ -66,6 +73,37 @@ def drive() -> Variant:
     )
 
 
+class Case(NamedTuple):
+    """What is driven.
+
+    Attributes:
+        draw: Noise of trials, by their keys.
+        score: Largest error [m] of each trial.
+        threshold: [m] that a failure exceeds, by default.
+        about: What the results depend on.
+    """
+
+    draw: Callable[[Key], Any]
+    score: Callable[[Any], Any]
+    threshold: float
+    about: Any
+
+
+def case_of(name: str) -> Case:
+    """The drive with a name.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if name == "landmarks":
+        about = landmark_drive.WAYPOINTS, landmark_drive.NUM_SCANS
+        return Case(landmark_drive.draw, landmark_drive.score, 0.059, about)
+    if name != "scans":
+        raise ValueError(f"--drive is {name!r}, not landmarks or scans")
+    own = TrialsFromNoise(drive())
+    return Case(own.draw, own.score, 0.0165, (CONFIG, ENCODER_NOISE, NUM_SCANS))
+
+
 def numbers_of(found: RareFailure) -> common.Numbers:
     """Result of a splitting for JSON."""
     return {
@@ -80,20 +118,20 @@ def numbers_of(found: RareFailure) -> common.Numbers:
 
 
 def split(
-    trials: TrialsFromNoise, seed: int, number: int, threshold: float, level_trials: int
+    case: Case, seed: int, number: int, threshold: float, level_trials: int
 ) -> common.Numbers:
     """Estimate by splitting; each number has other noise."""
     key = jax.random.fold_in(jax.random.key(seed), number)
     own: dict[str, Any] = {"threshold": threshold, "level_trials": level_trials}
-    return numbers_of(rare_failure(key, trials.draw, trials.score, **own))
+    return numbers_of(rare_failure(key, case.draw, case.score, **own))
 
 
-def plain(trials: TrialsFromNoise, seed: int, first: int, end: int) -> common.Numbers:
+def plain(case: Case, seed: int, first: int, end: int) -> common.Numbers:
     """Scores of the plain trials with the numbers `first` to `end` - 1."""
-    parts = [
-        trials.score(trials.noise_of(seed, np.arange(i, min(i + PLAIN_GROUP, end))))
-        for i in range(first, end, PLAIN_GROUP)
-    ]
+    key, parts = jax.random.key(seed), []
+    for begin in range(first, end, PLAIN_GROUP):
+        numbers = jnp.arange(begin, min(begin + PLAIN_GROUP, end))
+        parts.append(np.asarray(case.score(case.draw(trial_keys(key, numbers)))))
     return {"scores": [round(float(x), 6) for x in np.concatenate(parts)]}
 
 
@@ -166,32 +204,31 @@ def draw(numbers: common.Numbers, path: Path) -> None:
 @common.report_errors(NAME, ValueError)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment."""
-    arguments = common.parse(
-        __doc__, argv, threshold=0.0165, level_trials=500, repetitions=8, plain_trials=100_000
-    )
+    sizes = {"level_trials": 500, "repetitions": 8, "plain_trials": 100_000}
+    arguments = common.parse(__doc__, argv, drive="landmarks", threshold=0.0, **sizes)
     use_cpu_devices()
     enable_caches()
-    trials, seed = TrialsFromNoise(drive()), arguments.seed
-    keep = common.ResultCache(arguments.out / f".{NAME}", (seed, CONFIG, ENCODER_NOISE, NUM_SCANS))
-    level = arguments.threshold, arguments.level_trials
+    case, seed = case_of(arguments.drive), arguments.seed
+    keep = common.ResultCache(arguments.out / f".{NAME}_{arguments.drive}", (seed, case.about))
+    level = arguments.threshold or case.threshold, arguments.level_trials
     found = []
     for k in tqdm(range(arguments.repetitions), unit="splitting", leave=False):
         name = f"splitting {k} {level[0]:g} {level[1]}"
-        found.append(keep(name, partial(split, trials, seed, k, *level)))
+        found.append(keep(name, partial(split, case, seed, k, *level)))
         print(found[-1]["line"], flush=True)
     total, parts = arguments.plain_trials, []
     with tqdm(total=total, unit="trial", leave=False) as bar:
         for first in range(0, total, PLAIN_BATCH):
             end = min(first + PLAIN_BATCH, total)
             # Other noise than that of the splitting, whatever its seed.
-            own = partial(plain, trials, seed + 1_000_003, first, end)
+            own = partial(plain, case, seed + 1_000_003, first, end)
             parts.append(keep(f"plain {first} {end}", own)["scores"])
             bar.update(end - first)
     scores = np.array([np.inf if x is None else x for x in np.concatenate(parts)])
     numbers = {
+        "drive": arguments.drive,
         "threshold_m": level[0],
         "level_trials": level[1],
-        "scans": NUM_SCANS,
         "splitting": found,
         "compared": compare(found, scores, level[0]),
     }

@@ -4,7 +4,7 @@ A robot with a small scanner, which is not quite where its user thinks, drives t
 room; a few beams do not return. `derivative` is that of the logarithm of the position RMSE of a
 trial by the logarithm of a parameter (an elasticity), or by its unit where it is a pose, with its
 standard error; `method` is how it was found. Gradients are compared with paired differences on the
-same trials: `distance` is in standard errors of the difference, and where it is above 3 the
+same trials: `distance` is in standard errors of the difference, and where it is above 2 the
 derivative is by the differences. `halved` is the effect of half the parameter, measured; of twice
 the period of the scans.
 """
@@ -59,7 +59,7 @@ def numbers_of(one: Sensitivity) -> common.Numbers:
 
 def draw(numbers: common.Numbers, path: Path) -> None:
     """Draw elasticities by both methods, and the effects of half of each parameter."""
-    figure, axes = common.canvas(10, 4, 1, 2)
+    figure, axes = common.canvas(12, 4, 1, 2)
     axis, beside = axes[0]
     rows = [one for one in numbers["sensitivities"] if one["parameter"]["is_log"]][::-1]
     labels = [one["parameter"]["name"] for one in rows]
@@ -76,8 +76,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
         )
     axis.axvline(0.0, color=common.BLACK, linewidth=0.5)
     axis.set_yticks(range(len(rows)), labels)
-    axis.set(xlabel="d log(position RMSE) / d log(parameter), 2 standard errors")
-    axis.legend()
+    axis.set(xlabel="d log(position RMSE) / d log(parameter)", title="with 2 standard errors")
+    axis.legend(loc="upper left")
     order = numbers["improve_first"][::-1]
     own = {one["parameter"]["name"]: one for one in rows}
     for k, name in enumerate(order):
@@ -88,7 +88,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     texts = [f"{x}, {'doubled' if own[x]['parameter']['one_sided'] else 'halved'}" for x in order]
     beside.set_yticks(range(len(order)), texts)
     beside.axvline(0.0, color=common.BLACK, linewidth=0.5)
-    beside.set(xlabel="change of the error [%], 2 standard errors")
+    beside.set(xlabel="change of the error [%]", title="what to improve first, at the top")
     figure.savefig(path)
 
 

@@ -18,7 +18,8 @@ moves that are accepted.
 
 The standard error counts a chain and its relatives, those that begin in the same chain of the level
 before, as one draw, because they are not independent. It is good where scores rise little by little
-to a failure, and too small where a failure comes at once: see `RareFailure.is_uncertain`.
+to a failure. Where failures come at once, most results are too low, a few too high, and not all of
+them are `is_uncertain`: repeat it with other keys, and `combine` the results.
 
 References:
     Au, Beck (2001), "Estimation of small failure probabilities in high dimensions by subset
@@ -28,7 +29,7 @@ References:
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -94,8 +95,8 @@ class RareFailure(NamedTuple):
     def is_uncertain(self) -> bool:
         """Whether the trials of a level are those of few families: the interval may be too short.
 
-        It is so where the score does not show how near a failure is, because it comes at once, as
-        where data association goes wrong: take more `level_trials`, and another key.
+        It is so where few trials of a level show the path to a failure: take more `level_trials`,
+        and other keys.
         """
         return any(level.relative_error > FEW_CHAINS for level in self.levels)
 
@@ -185,6 +186,23 @@ def rare_failure(
             move = float(np.clip(move * np.exp(accepted[-1] - ACCEPTANCE), *MOVES))
         population, scores = _join(states), np.concatenate(history)
         chain, acceptance = np.tile(np.arange(chains), length), float(np.mean(accepted))
+
+
+def combine(found: Sequence[RareFailure]) -> Interval:
+    """Mean probability of results with different keys, and its interval by their spread.
+
+    A result that did not reach the threshold counts as 0.
+
+    Raises:
+        ValueError: There is one result, or the thresholds differ.
+    """
+    if len(found) < 2 or len({one.threshold for one in found}) > 1:
+        raise ValueError("found holds one result, or those of several thresholds")
+    values = np.array([one.probability.value if one.reached else 0.0 for one in found])
+    error = values.std(ddof=1) / math.sqrt(len(values))
+    width = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * error
+    mean = float(values.mean())
+    return Interval(mean, max(0.0, mean - float(width)), min(1.0, mean + float(width)))
 
 
 def describe(found: RareFailure, unit: str = "m") -> str:

@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxslam.core.types import as_float64, as_size
 
-AGREEMENT = 3.0  # standard errors
+AGREEMENT = 2.0  # standard errors; a right gradient is refused one time in twenty
 MIN_TRIALS = 8
 TINY = 1e-9  # of a standard error, where gradient and differences are the same
 STEPS = 1.0, 2.0, 4.0  # that are tried, in those of the parameter

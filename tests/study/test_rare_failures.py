@@ -12,7 +12,7 @@ from jaxslam.pipeline.episodes import filter_episodes
 from jaxslam.simulation import Robot, densify, named
 from jaxslam.simulation.trial_noise import simulate_from_noise
 from jaxslam.study import rare_failures
-from jaxslam.study.rare_failures import describe, move_noise, rare_failure
+from jaxslam.study.rare_failures import combine, describe, move_noise, rare_failure
 from jaxslam.study.runner import Variant
 from jaxslam.study.trials_from_noise import TrialsFromNoise, largest_error
 
@@ -63,6 +63,17 @@ def test_the_tail_of_a_normal_is_found_with_few_trials(repeated):
     assert np.sum(holds) >= stats.binom.ppf(0.001, len(repeated), 0.9)
     assert all(1110 <= one.num_trials <= 1650 for one in repeated)
     assert np.median([one.plain_trials / one.num_trials for one in repeated]) > 15
+
+
+def test_results_are_combined_by_their_spread(repeated):
+    mean, low, high = combine(repeated)
+    values = [one.probability.value for one in repeated]
+    wanted = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    np.testing.assert_allclose([mean, low, high], [np.mean(values), *wanted])
+    missed = repeated[0]._replace(probability=repeated[0].probability, scores=np.zeros(0))
+    assert np.isclose(combine([repeated[1], missed]).value, values[1] / 2)
+    with pytest.raises(ValueError, match="one result"):
+        combine(repeated[:1])
 
 
 def test_failures_are_noise_whose_trials_fail(repeated):

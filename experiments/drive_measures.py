@@ -48,7 +48,7 @@ def feature_numbers(config: Config, result: SlamResult) -> Numbers:
     valid, kind = np.asarray(features.valid), np.asarray(features.kind)
     numbers: Numbers = {
         "matches": float(info.used.sum(axis=1).mean()),
-        "nis": float(info.nis.sum() / max(info.dof.sum(), 1)),
+        "nis": float(info.nis.sum()) / max(int(info.dof.sum()), 1),
     }
     nis, used = nis_of_features(config, result)
     for name, number in KINDS.items():

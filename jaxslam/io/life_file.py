@@ -12,6 +12,7 @@ does not happen.
     missing           probability that a beam does not return
     black, glass      share of the walls: `black_range` and `glass_angle` in which they are seen
     std_scale, std_per_range, std_by_incidence, resolution, spot     errors of ranges
+      shared_std, shared_angle               that beams share with their neighbours
     slip, carpet      of wheels: probability with `slip_share`, share of the floor and `carpet_turn`
     lost              probability that odometry fails, for `lost_scans`, `latched` or standing
     dropped           probability that a scan is lost
@@ -55,8 +56,10 @@ WHOLE = frozenset({"people"})
 """Keys of whole numbers."""
 
 KINDS = {
-    **dict.fromkeys(("resolution", "black_range", "distance", "carry", "moved_by"), "length"),
-    **dict.fromkeys(("spot", "glass_angle"), "angle"),
+    **dict.fromkeys(
+        ("resolution", "black_range", "distance", "carry", "moved_by", "shared_std"), "length"
+    ),
+    **dict.fromkeys(("spot", "glass_angle", "shared_angle"), "angle"),
     **dict.fromkeys(("door_period", "moved_at"), "time"),
     **{"speed": "speed", "std_by_incidence": "per angle", "carpet_turn": "angle over a length"},
     **dict.fromkeys(("people", "lost_scans"), "number"),
@@ -68,6 +71,7 @@ NEEDS = {
     **{"door_period": "closed", "moved_by": "moved", "moved_at": "moved", "moved": "moved_at"},
     **{"black_range": "black", "glass_angle": "glass", "slip_share": "slip"},
     **{"carpet_turn": "carpet", "lost_scans": "lost", "latched": "lost", "carry": "carried"},
+    "shared_angle": "shared_std",
 }
 """Keys that say nothing without another one."""
 

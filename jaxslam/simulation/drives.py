@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,44 +20,13 @@ from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import to_scan
 from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
-from jaxslam.simulation.life import Events, Life, draw_events, scan_life
+from jaxslam.simulation.drive_draws import SUBSTEPS, Draws, draw_drive
+from jaxslam.simulation.life import Events, Life, scan_life
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.scanners import Scanner
 from jaxslam.simulation.worlds import World
 
-SUBSTEPS = 4  # parts of the motion between two scans with encoder noise of their own
-LIFE = 1  # number of the key of what goes wrong, of that of a drive
 MAX_DEPARTURE = 0.5  # [m] from its path, of a robot that cannot turn on the spot
-
-
-class LifeDraws(NamedTuple):
-    """What goes wrong on a drive of T scans, drawn.
-
-    Attributes:
-        events: What happens on this drive.
-        failures: (T, 3) uniform draws of the odometry's failures.
-        kept: (T,) bool, which scans are not lost.
-    """
-
-    events: Events
-    failures: Array
-    kept: Array
-
-
-class Draws(NamedTuple):
-    """All that is random on a drive of T scans, drawn.
-
-    Attributes:
-        wheels: (T - 1, SUBSTEPS, D) standard normals of the encoders.
-        scans: (T,) keys of the scans.
-        ranges: (T, R) standard normals of the ranges; None: those of the keys.
-        life: What goes wrong; None: nothing.
-    """
-
-    wheels: Array
-    scans: Key
-    ranges: Array | None = None
-    life: LifeDraws | None = None
 
 
 def start_pose(path: Array) -> Array:
@@ -261,20 +230,7 @@ def _drive(
         A function that makes a scan of an item; the items [T], of which the first is the true pose
         (T, 3); and odometry increments (T, 3).
     """
-    drive_key, scan_key = jax.random.split(key)
-    shape = num_scans - 1, SUBSTEPS, kinematics.num_draws(robot)
-    draws = Draws(
-        wheels=jax.random.normal(drive_key, shape, path.dtype),
-        scans=jax.random.split(scan_key, num_scans),
-    )
-    if life is not None:
-        of_events, of_odometry, of_scans = jax.random.split(jax.random.fold_in(key, LIFE), 3)
-        drawn = LifeDraws(
-            events=draw_events(of_events, life, num_scans),
-            failures=wheel_faults.draw_failures(of_odometry, num_scans, path.dtype),
-            kept=wheel_faults.keeps_scan(of_scans, life.wheels, num_scans, path.dtype),
-        )
-        draws = draws._replace(life=drawn)
+    draws = draw_drive(key, robot, life, num_scans, path.dtype)
     given = lidar, robot, world, path
     return drive_and_scan(draws, *given, noise_by_incidence=noise_by_incidence, life=life)
 

@@ -20,7 +20,7 @@ from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.simulation import drives, kinematics, wheel_faults
-from jaxslam.simulation.drives import SUBSTEPS, Draws, LifeDraws
+from jaxslam.simulation.drive_draws import LIFE, SUBSTEPS, Draws, LifeDraws
 from jaxslam.simulation.life import Life, draw_events
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
@@ -65,7 +65,7 @@ def draws_of(noise: TrialNoise, life: Life | None) -> Draws:
     count, dtype = len(noise.scans), noise.wheels.dtype
 
     def uniform(own: Key) -> Array:
-        return jax.random.uniform(jax.random.fold_in(own, drives.LIFE), (8,), dtype)
+        return jax.random.uniform(jax.random.fold_in(own, LIFE), (8,), dtype)
 
     drawn = jax.vmap(uniform)(noise.scans)
     events = draw_events(noise.start, life, count)

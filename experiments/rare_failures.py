@@ -182,7 +182,7 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     for k, found in enumerate(numbers["splitting"]):
         levels = found["levels"]
         share = np.cumprod([x["share"] for x in levels])
-        label = f"splitting, {found['trials']} trials each" if k == 0 else None
+        label = f"splitting, {found['trials']} trials or so" if k == 0 else None
         at = [x["threshold"] for x in levels]
         axis.plot(at, share, "o-", color=common.ORANGE, alpha=0.5, markersize=4, label=label)
     axis.axvline(numbers["threshold_m"], color=common.BLUE, linestyle=":", label="failure")
@@ -196,7 +196,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     p = own["probability"]
     beside.axvspan(p["low"], p["high"], color=common.SKY, alpha=0.4)
     beside.axvline(p["value"], color=common.BLACK)
-    beside.set(xscale="log", xlabel=f"probability of more than {numbers['threshold_m']:g} m")
+    common.log_scale(beside, "x")
+    beside.set(xlabel=f"probability of more than {numbers['threshold_m']:g} m")
     beside.set(ylabel="repetition", title="95 % intervals; band: plain trials")
     figure.savefig(path)
 

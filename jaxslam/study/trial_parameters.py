@@ -78,7 +78,7 @@ class TrialErrors:
         self.parameters = tuple(parameter_of(variant, name) for name in names)
         self._names = tuple(names)
         self._trials = TrialsFromNoise(variant)
-        self._noise = self._trials.noise_of(seed, np.arange(num_trials))
+        self._noise = self._trials.plain_noise(seed, np.arange(num_trials))
 
     def log_errors(self, changes: np.ndarray) -> np.ndarray:
         """Logarithms (N,) of the position RMSE [m] with changes (P,); NaN where not finite."""
@@ -232,7 +232,7 @@ def _gradients(
             mount_error=own.mount_error,
         )
         truth = items[0]
-        features = jax.vmap(seen_from)(truth, episode.truth, episode.features)
+        features = jax.vmap(features_from_pose)(truth, episode.truth, episode.features)
         moved = episode._replace(truth=truth, odometry=odometry, features=features)
         result = filter_episode(config, own.params, moved)
         return jnp.where(result.finite, log_rmse(result), jnp.nan)
@@ -247,7 +247,7 @@ def keeps(period: Array, num_scans: int) -> Array:
     return jnp.diff(jnp.floor(passed + 1e-4)) > 0.0
 
 
-def seen_from(pose: Array, seen_at: Array, features: Features) -> Features:
+def features_from_pose(pose: Array, seen_at: Array, features: Features) -> Features:
     """Features of a scan as from another pose, with the same errors in the frame of the world.
 
     Args:

@@ -80,7 +80,7 @@ class TrialsFromNoise:
         own = self._variant
         return draw_noises(keys, own.config.frontend.lidar, own.robot, own.num_scans)
 
-    def noise_of(self, seed: int, numbers: np.ndarray) -> TrialNoise:
+    def plain_noise(self, seed: int, numbers: np.ndarray) -> TrialNoise:
         """Noise [B] of plain trials with the numbers (B,), each the same in any company."""
         return self.draw(trial_keys(jax.random.key(seed), jnp.asarray(numbers, jnp.int32)))
 

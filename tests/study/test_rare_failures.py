@@ -186,13 +186,14 @@ VARIANT = Variant(
 )
 
 
+@pytest.mark.slow
 def test_trials_of_a_variant_are_functions_of_their_noise():
     """Each trial is that of its own noise in any company, and its score that of its result."""
     trials = TrialsFromNoise(VARIANT)
-    noise = trials.noise_of(0, np.arange(6))
+    noise = trials.plain_noise(0, np.arange(6))
     scores, results = trials.score(noise), trials.results(noise)
     np.testing.assert_allclose(scores, jax.vmap(largest_error)(results), rtol=1e-6)
-    some = trials.noise_of(0, np.array([5, 2]))
+    some = trials.plain_noise(0, np.array([5, 2]))
     np.testing.assert_allclose(trials.score(some), scores[[5, 2]], rtol=1e-6)
     world = jax.tree.map(jnp.asarray, VARIANT.world)
     one = jax.tree.map(lambda x: x[2], noise)

@@ -21,7 +21,7 @@ from jaxslam.study.sensitivities import (
     ranked,
     sensitivities,
 )
-from jaxslam.study.trial_parameters import TrialErrors, keeps, parameter_of, seen_from
+from jaxslam.study.trial_parameters import TrialErrors, features_from_pose, keeps, parameter_of
 
 N = 4000
 A, B = 0.03, 0.01  # [m] of two kinds of noise
@@ -168,7 +168,7 @@ def test_features_are_seen_from_another_pose():
         trusted=true,
         valid=true,
     )
-    seen = jax.jit(seen_from)(now, was, features)
+    seen = jax.jit(features_from_pose)(now, was, features)
     turn = float(was[2] - now[2])
 
     def world(pose, xy):

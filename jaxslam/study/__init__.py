@@ -4,8 +4,11 @@ from jaxslam.study.outcomes import Outcomes as Outcomes
 from jaxslam.study.outcomes import compare as compare
 from jaxslam.study.outcomes import failures_by_place as failures_by_place
 from jaxslam.study.outcomes import summarise as summarise
+from jaxslam.study.rare_failures import rare_failure as rare_failure
 from jaxslam.study.reporting import report as report
 from jaxslam.study.runner import Variant as Variant
 from jaxslam.study.runner import run as run
 from jaxslam.study.runner import run_timed as run_timed
+from jaxslam.study.trial_parameters import TrialErrors as TrialErrors
+from jaxslam.study.trials_from_noise import TrialsFromNoise as TrialsFromNoise
 from jaxslam.study.wording import findings as findings

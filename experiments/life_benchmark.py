@@ -28,7 +28,7 @@ from jaxslam.simulation import (
     trials,
     with_index,
 )
-from jaxslam.simulation.named_worlds import named_path, named_world
+from jaxslam.simulation.named_worlds import named, named_path
 
 BUILDING = "random:1:100x60"  # of 5,918 walls
 PATH_LENGTH = 75.0  # [m] of its patrol, as long as the drive of the office
@@ -50,7 +50,7 @@ def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     office, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
     keys = trials.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    plain = World(jnp.asarray(named_world(BUILDING).walls, float))
+    plain = World(jnp.asarray(named(BUILDING).walls, float))
     indexed = with_index(plain, lidar.range_max)
     patrol = named_path(BUILDING)
     patrol = patrol[polylines.cumulative_lengths(patrol) < PATH_LENGTH]

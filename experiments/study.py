@@ -48,7 +48,7 @@ def building_of(name: str, maps: Path | None, intel: Path | None) -> tuple[World
         InputError: Its file is not given, or cannot be read.
     """
     if name.startswith("random:"):
-        world, occupancy = named_worlds.named_world(name), None
+        world, occupancy = named_worlds.named(name), None
     else:
         file = intel
         if name == BUILDINGS[0]:

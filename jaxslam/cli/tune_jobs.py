@@ -95,7 +95,7 @@ def simulated_task(
 ) -> TuneTask:
     """Check the options of a tuning on simulated trials."""
     with name_errors("--world"):
-        walls = World(jnp.asarray(named_worlds.named_world(world).walls, float))
+        walls = World(jnp.asarray(named_worlds.named(world).walls, float))
         path = jnp.asarray(named_worlds.named_path(world), float)
     params = read_params(noise, NoiseParams.for_laser_log())
 

@@ -77,7 +77,7 @@ def read_building(
             if not is_random and world not in worlds.NAMES:
                 known = ", ".join([*worlds.NAMES, NAME_FORM])
                 raise ValueError(f"no world named {world!r:.40}; there are {known}, and files")
-            building = WorldFile(named_worlds.named_world(world), (), np.zeros(2))
+            building = WorldFile(named_worlds.named(world), (), np.zeros(2))
             if is_random and path is None:
                 drive = drive or "patrol"
             points = worlds.waypoints(world) if path is None and drive is None else None

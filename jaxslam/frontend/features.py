@@ -70,7 +70,12 @@ def check_feature_spec(spec: FeatureSpec) -> None:
     """Raise ValueError, naming the field, unless capacities of features are possible."""
     if not isinstance(spec, FeatureSpec):
         raise ValueError(f"features is a {type(spec).__name__}, not a FeatureSpec")
-    for name in ("max_junctions", "max_corners", "max_walls", "max_coarse_candidates"):
+    if spec.max_junctions < 1:
+        raise ValueError(
+            f"features.max_junctions is {spec.max_junctions}, not 1 or more; for a filter without "
+            "junctions leave them out of filter.landmark_kinds"
+        )
+    for name in ("max_corners", "max_walls", "max_coarse_candidates"):
         if getattr(spec, name) < 0:
             raise ValueError(f"features.{name} is {getattr(spec, name)}, not 0 or more")
 

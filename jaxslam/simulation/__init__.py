@@ -11,6 +11,8 @@ from jaxslam.simulation.kinematics import noise_params as noise_params
 from jaxslam.simulation.life import Life as Life
 from jaxslam.simulation.life import life_in as life_in
 from jaxslam.simulation.life_defaults import typical_life as typical_life
+from jaxslam.simulation.named_worlds import named as named
+from jaxslam.simulation.named_worlds import named_path as named_path
 from jaxslam.simulation.path_following import densify as densify
 from jaxslam.simulation.path_following import pure_pursuit as pure_pursuit
 from jaxslam.simulation.patrols import patrol as patrol
@@ -31,7 +33,6 @@ from jaxslam.simulation.trials import simulate_keys as simulate_keys
 from jaxslam.simulation.trials import trial_keys as trial_keys
 from jaxslam.simulation.wheel_faults import WheelFaults as WheelFaults
 from jaxslam.simulation.worlds import World as World
-from jaxslam.simulation.worlds import named as named
 from jaxslam.simulation.worlds import scan_poses as scan_poses
 from jaxslam.simulation.worlds import waypoints as waypoints
 from jaxslam.simulation.worlds import with_index as with_index

@@ -150,7 +150,7 @@ def as_world(world: Any, range_max: float | None = None) -> World:
         ValueError: There is no world of this name, or the walls are not (S, 4) finite numbers.
     """
     if isinstance(world, str):
-        walls = jnp.asarray(named_worlds.named_world(world).walls, float)
+        walls = jnp.asarray(named_worlds.named(world).walls, float)
         return World(walls) if range_max is None else with_index(World(walls), range_max)
     if not isinstance(world, World):
         raise ValueError(

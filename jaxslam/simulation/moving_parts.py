@@ -202,6 +202,6 @@ def doors_by_name(name: str) -> np.ndarray:
     if name.startswith(buildings.PREFIX):
         found = doors_of_building(name)
     else:
-        found = find_doors(named_worlds.named_world(name).walls)
+        found = find_doors(named_worlds.named(name).walls)
     found.setflags(write=False)
     return found

@@ -16,7 +16,7 @@ DRIVES: dict[str, Callable[..., FoundDrive]] = {"patrol": patrols.patrol, "route
 """What finds a drive in any world, by name."""
 
 
-def named_world(name: str) -> World:
+def named(name: str) -> World:
     """The world of a name: one of `worlds.NAMES`, or a random building.
 
     Raises:

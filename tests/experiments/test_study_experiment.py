@@ -16,7 +16,7 @@ N = 12
 @pytest.fixture
 def variants(monkeypatch):
     """The variants, whose buildings are all the random one."""
-    world, path = named_worlds.named_world("random:7"), named_worlds.named_path("random:7")
+    world, path = named_worlds.named("random:7"), named_worlds.named_path("random:7")
     monkeypatch.setattr(study, "building_of", lambda *_: (world, np.asarray(path)))
     monkeypatch.setattr(study.drives, "num_scans_of_drive", lambda *_: 6)
     return study.variants_of(None, None, 10.0)

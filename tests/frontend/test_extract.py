@@ -130,6 +130,11 @@ GOOD = to_scan(LIDAR, RANGES)
             "features.max_corners is 7, more than segments.max_segments, 6",
         ),
         (
+            SMALL._replace(features=FeatureSpec(max_junctions=0)),
+            GOOD,
+            "features.max_junctions is 0, not 1 or more",
+        ),
+        (
             SMALL._replace(features=FeatureSpec(max_junctions=60, max_corners=2)),
             GOOD,
             "features.max_junctions is 60, too many for a grid of (30, 40) cells",

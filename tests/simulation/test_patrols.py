@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 from scipy.sparse import csgraph, csr_array
 
+from jaxslam import simulation
 from jaxslam.core.maps import OccupancyMap
 from jaxslam.simulation import arguments, drives, named_worlds, wall_grid, worlds
 from jaxslam.simulation.buildings import building
@@ -291,7 +292,7 @@ def test_a_random_building_is_a_world_with_a_patrol():
     with pytest.raises(ValueError, match="no kind of drive named 'walk'; there are: patrol, route"):
         named_worlds.found_drive(World(OFFICE), "walk")
     with pytest.raises(ValueError, match="no world named 'moon'; .*, random:SEED"):
-        named_worlds.named_world("moon")
+        named_worlds.named("moon")
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -338,3 +339,10 @@ def test_a_visiting_order_goes_round_a_circle():
     order = visiting_order(distance, closed=True, first=False)
     assert np.isclose(distance[order[:-1], order[1:]].sum(), 120 * np.sin(np.pi / 60))
     assert visiting_order(distance[:1, :1], closed=False, first=False) == [0]
+
+
+def test_random_buildings_are_named_like_the_built_in_worlds():
+    walls = np.asarray(simulation.named("random:3:12.5x10").walls)
+    np.testing.assert_array_equal(walls, simulation.building(3, (12.5, 10.0)).world.walls)
+    np.testing.assert_array_equal(simulation.named("office").walls, worlds.named("office").walls)
+    assert len(simulation.named_path("random:3:12.5x10")) > 100

@@ -72,8 +72,9 @@ def study(
     scans = sum(one.num_scans for one in prepared.variants) * asked.num_trials
     for note in prepared.notes:
         print(f"note: {note}", flush=True)
+    count = len(prepared.variants)
     print(
-        f"{study_toml}: {len(prepared.variants)} variants of {asked.num_trials} trials, "
+        f"{study_toml}: {count} variant{'s' if count > 1 else ''} of {asked.num_trials} trials, "
         f"{scans} scans",
         flush=True,
     )

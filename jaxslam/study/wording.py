@@ -15,7 +15,8 @@ def findings(numbers: Metrics) -> list[str]:
     """Sentences on the numbers of `reporting.report`, the most important first."""
     rows = numbers["variants"]
     first = (
-        f"{len(rows)} variants of {numbers['trials']} trials. A trial succeeds if its position is "
+        f"{len(rows)} variant{'s' if len(rows) > 1 else ''} of {numbers['trials']} trials. "
+        "A trial succeeds if its position is "
         f"never more than {numbers['success_m']:g} m off; [ ] are 95 % intervals."
     )
     if len(rows) == 1:

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from jaxslam.core.types import AnyArray, Metrics
 from jaxslam.viz.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY
@@ -135,6 +136,9 @@ def _draw_quantiles(axis: Axes, summaries: Sequence[Metrics]) -> None:
     axis.invert_yaxis()
     if any(one["position_rmse_m"]["p50"]["value"] for one in summaries):
         axis.set_xscale("log")
+        axis.xaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.xaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
     axis.grid(axis="x", alpha=0.3)
     axis.legend(fontsize=8)
 

@@ -58,6 +58,10 @@ def life_of(
     parts = life_file.parts(settings)
     moves = parts.pop("furniture")
     note = life_file.describe(settings)
+    if parts.pop("crowding").people_per_metre and "people" not in settings:
+        people = life_file.number_of_people(settings, building.path)
+        parts["traffic"] = parts["traffic"]._replace(people=people)
+        note += f": people {people}"
     world, doors, furniture = building.world, None, None
     if parts["traffic"].closed:
         doors = _doors(building)

@@ -83,8 +83,9 @@ def simulate(
         robot: File of the robot, TOML or JSON: scanner, drive, noise, limits, mount; by default it
             has two wheels 0.4 m apart and 361 beams ahead. `jaxslam.io.robot_file` documents it.
         life: File of what goes wrong, TOML or JSON: people, doors, furniture, glass, missing beams,
-            slip, lost odometry and scans; by default ranges have their noise and nothing else does.
-            `jaxslam.io.life_file` documents it.
+            slip, lost odometry and scans; or `typical`, what recorded drives show on average; by
+            default ranges have their noise and nothing else does. `jaxslam.io.life_file` documents
+            it.
         landmarks: Landmark types: all, or only the junctions of the Voronoi diagram (the paper's
             nodes).
         labels: Labels of occupied cells in the Voronoi expansion: straight wall segments, or the

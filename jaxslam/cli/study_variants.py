@@ -57,7 +57,11 @@ def prepare(study: StudyFile) -> Prepared:
     found: dict[str, Variant] = {}
     given = [with_life(one.settings, study.path.parent) for one in study.variants]
     _check_used(study.path, given)
-    slots = max(own.get("life.people", 0) for own in given)
+    slots = 0
+    for (name, *_), own in zip(study.variants, given, strict=True):
+        with name_errors(f"{study.path}: {name}"):
+            place = _place(files_of(own, study.path.parent))
+            slots = max(slots, life_file.number_of_people(_life_in(own), _building(*place).path))
     # All of them draw the same random numbers then, and run the same program.
     lives = any(key in LIFE for own in given for key in own)
     for (name, settings, cost), all_of_it in zip(study.variants, given, strict=True):
@@ -83,7 +87,7 @@ def _variant(
     notes: dict[str, None],
 ) -> Variant:
     """The variant with some settings; adds to the notes. Without slots nothing goes wrong."""
-    place = tuple(given.get(key) for key in ("world", "path", "drive", "resolution", "unit"))
+    place = _place(given)
     building = _building(*place)
     robot, config = _robot(given, notes)
     notes |= dict.fromkeys(building.notes)
@@ -94,7 +98,7 @@ def _variant(
             filter=config.filter._replace(max_landmarks=given["max_landmarks"])
         )
     world, life = building.world, None
-    wrong = {LIFE[key]: x for key, x in given.items() if key in LIFE}
+    wrong = _life_in(given)
     if slots is not None:
         living = _living(place, tuple(wrong.items()), slots, seed)
         world, life = living.world, living.life
@@ -117,6 +121,16 @@ def _variant(
         _num_scans(robot, *driven),
         life,
     )
+
+
+def _place(given: Settings) -> tuple:
+    """What names a building and a drive in it."""
+    return tuple(given.get(key) for key in ("world", "path", "drive", "resolution", "unit"))
+
+
+def _life_in(given: Settings) -> dict[str, float]:
+    """What goes wrong, by the keys of `life_file`."""
+    return {LIFE[key]: x for key, x in given.items() if key in LIFE}
 
 
 @lru_cache(maxsize=16)
@@ -190,9 +204,7 @@ def _params(given: Settings, robot: Robot) -> NoiseParams:
 
 def _check_used(path: Path, given: list[Settings]) -> None:
     """Raise InputError if a setting of what goes wrong says nothing in any variant."""
-    wrong = life_file.unused(
-        {LIFE[key]: x for key, x in own.items() if key in LIFE} for own in given
-    )
+    wrong = life_file.unused(map(_life_in, given))
     if wrong is not None:
         key, other = wrong
         problem = f"says nothing without life.{other}"

@@ -2,9 +2,11 @@
 
 A value is a number in the SI unit, or a text with its unit ("0.8 m/s", "10 %"); an unknown key is
 an error. In a study (`study.study_file`) the same keys are called `life.KEY`. What is not there
-does not happen.
+does not happen. `typical` instead of a file is what recorded drives show on average
+(`simulation.life_defaults`).
 
     people            number of them, walking to and fro along the drive
+    people_per_metre  or this many on each square metre that the drive passes
       speed, standing, carts, distance       of people: mean speed, share of the time and of them
     closed            share of the time in which each door is closed
       door_period     after which a door may change
@@ -24,11 +26,12 @@ does not happen.
 from collections.abc import Iterable, Mapping
 from os import PathLike
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxslam.io import toml_or_json
 from jaxslam.io.quantities import Table
 from jaxslam.simulation.life import AT_LEAST_ONE, POSITIVE, PROBABILITIES
+from jaxslam.simulation.life_defaults import people_on, typical_settings
 from jaxslam.simulation.moving_parts import Moves
 from jaxslam.simulation.range_errors import RangeErrors
 from jaxslam.simulation.traffic import Traffic
@@ -42,8 +45,28 @@ closed = 0.2             # of the time, each door
 slip = 0.01
 """
 
+TYPICAL = "typical"
+"""Name of `life_defaults.typical_settings`, instead of a file."""
+
+
+class Crowding(NamedTuple):
+    """How many people there are, where `people` is not given.
+
+    Attributes:
+        people_per_metre: [1 / m] on each square metre that the drive passes.
+    """
+
+    people_per_metre: float = 0.0
+
+
 PARTS: Mapping[str, Any] = MappingProxyType(
-    {"ranges": RangeErrors, "traffic": Traffic, "wheels": WheelFaults, "furniture": Moves}
+    {
+        "ranges": RangeErrors,
+        "traffic": Traffic,
+        "wheels": WheelFaults,
+        "furniture": Moves,
+        "crowding": Crowding,
+    }
 )
 """The records whose fields are the keys."""
 
@@ -62,7 +85,7 @@ KINDS = {
     **dict.fromkeys(("spot", "glass_angle", "shared_angle"), "angle"),
     **dict.fromkeys(("door_period", "moved_at"), "time"),
     **{"speed": "speed", "std_by_incidence": "per angle", "carpet_turn": "angle over a length"},
-    **dict.fromkeys(("people", "lost_scans"), "number"),
+    **dict.fromkeys(("people", "people_per_metre", "lost_scans"), "number"),
 }
 """Kinds of `quantities`, of those keys that are no ratios."""
 
@@ -82,7 +105,7 @@ def read(path: str | PathLike) -> dict[str, float]:
     """Read what goes wrong.
 
     Args:
-        path: TOML or JSON file, as above.
+        path: TOML or JSON file, as above, or `TYPICAL`.
 
     Returns:
         Numbers in SI units by their keys, as they are in the file.
@@ -91,6 +114,8 @@ def read(path: str | PathLike) -> dict[str, float]:
         InputError: The file cannot be read, or is neither; a key is unknown, or says nothing
             without another one; a value is not possible, or has an unknown unit.
     """
+    if str(path) == TYPICAL:
+        return typical_settings()
     advice = "write KEY = NUMBER; jaxslam.io.life_file has the keys"
     content = toml_or_json.read(path, advice)
     table = Table(path, "life", content)
@@ -132,9 +157,17 @@ def unused(all_settings: Iterable[Mapping[str, float]]) -> tuple[str, str] | Non
     everywhere = list(all_settings)
     for key, other in NEEDS.items():
         given = [own for own in everywhere if key in own]
-        if given and not any(own.get(other) for own in given):
+        others = (other, "people_per_metre") if other == "people" else (other,)
+        if given and not any(own.get(name) for own in given for name in others):
             return key, other
     return None
+
+
+def number_of_people(settings: Mapping[str, float], path: Any) -> int:
+    """How many people there are along a drive (N, 2) [m]: `people`, if it is given."""
+    if "people" in settings:
+        return int(settings["people"])
+    return people_on(path, settings.get("people_per_metre", 0.0))
 
 
 def parts(settings: Mapping[str, float]) -> dict[str, Any]:

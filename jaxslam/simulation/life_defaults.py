@@ -23,6 +23,20 @@ CARTS = 0.1
 WHEELS = WheelFaults(slip=0.06, slip_share=0.05)
 
 
+def typical_settings() -> dict[str, float]:
+    """The same numbers by their names, as `jaxslam.io.life_file` has them."""
+    found = {"people_per_metre": PEOPLE_PER_METRE, "carts": CARTS}
+    for own, none in ((RANGES, RangeErrors()), (WHEELS, WheelFaults())):
+        given, default = own._asdict(), none._asdict()
+        found |= {key: float(x) for key, x in given.items() if x != default[key]}
+    return found
+
+
+def people_on(path: Any, people_per_metre: float) -> int:
+    """Number of people on the walkway along a path (N, 2) [m]."""
+    return int(np.round(people_per_metre * walkway_length(path)))
+
+
 def typical_life(
     world: World,
     path: Any,
@@ -49,8 +63,7 @@ def typical_life(
     Raises:
         ValueError: An argument is not possible.
     """
-    people = float(np.round(people_per_metre * walkway_length(path)))
-    traffic = Traffic(people=people, carts=CARTS)
+    traffic = Traffic(people=float(people_on(path, people_per_metre)), carts=CARTS)
     own = {"max_people": max_people, "doors": doors, "furniture": furniture}
     return life_in(world, path, ranges=ranges, traffic=traffic, wheels=wheels, **own)
 

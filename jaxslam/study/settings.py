@@ -18,7 +18,7 @@ TEXTS = {
     "robot": "file of the robot",
     "scanner": "name of a scanner",
     "noise": "file of the noise parameters of the filter",
-    "life": "file of what goes wrong, as of `jaxslam simulate --life`",
+    "life": "file of what goes wrong, or typical, as of `jaxslam simulate --life`",
     "landmarks": "all or junctions",
     "labels": "segments or codes",
 }
@@ -135,7 +135,9 @@ def with_life(settings: Mapping[str, Any], folder: Path) -> Settings:
     own = {key: x for key, x in settings.items() if key != "life"}
     if "life" not in settings:
         return own
-    return {f"life.{k}": x for k, x in life_file.read(folder / settings["life"]).items()} | own
+    given = settings["life"]
+    file = given if given == life_file.TYPICAL else folder / given
+    return {f"life.{k}": x for k, x in life_file.read(file).items()} | own
 
 
 def files_of(settings: Mapping[str, Any], folder: Path) -> Settings:

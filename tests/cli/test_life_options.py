@@ -30,6 +30,10 @@ def test_doors_and_furniture_are_found_where_they_are_asked_for():
     assert len(found.life.movers.doors) == 13 and len(found.life.movers.people) == 4
     assert found.note == "closed 0.3, people 2; 13 doors"
     room = building(np.concatenate([SQUARE, CHAIR]))
+    crowded = life_of(office, {"people_per_metre": 0.1, "speed": 0.5})
+    people = int(crowded.life.traffic.people)
+    assert people > 3 and crowded.note.endswith(f": people {people}")
+    assert len(crowded.life.movers.people) == people
     moved = life_of(room, {"moved": 1.0, "moved_at": 9.0, "moved_by": 1.0})
     assert moved.note.endswith("1 pieces of furniture are moved")
     np.testing.assert_allclose(moved.world.walls, SQUARE)

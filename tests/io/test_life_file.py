@@ -1,9 +1,11 @@
 """Files of what goes wrong: their keys are those of `Life`, wrong ones are one line."""
 
+import jax
 import pytest
 
 from jaxslam.io import life_file
 from jaxslam.io.errors import InputError
+from jaxslam.simulation import life_defaults, named
 from jaxslam.simulation.life import check_numbers_of
 
 
@@ -39,7 +41,7 @@ def test_what_the_file_takes_the_simulation_takes(tmp_path):
         assert accepted
         for value in accepted:
             for name, part in life_file.parts({key: value}).items():
-                if name != "furniture":
+                if name not in ("furniture", "crowding"):
                     check_numbers_of(name, part)
 
 
@@ -65,3 +67,18 @@ def test_what_is_refused_is_one_line(tmp_path, text, message):
     with pytest.raises(InputError) as caught:
         read(tmp_path, text)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_typical_is_the_life_of_the_defaults(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = life_file.read("typical")
+    path = [(0.0, 0.0), (300.0, 0.0)]
+    parts, wanted = life_file.parts(found), life_defaults.typical_life(named("office"), path)
+    for name in ("ranges", "wheels"):
+        expected = jax.tree.map(float, getattr(wanted, name))
+        assert jax.tree.map(float, parts[name])._asdict() == pytest.approx(
+            expected._asdict(), rel=1e-6
+        )
+    assert life_file.number_of_people(found, path) == float(wanted.traffic.people) == 4
+    assert life_file.number_of_people(found | {"people": 9}, path) == 9
+    assert life_file.unused([found]) is None

@@ -15,7 +15,7 @@ from jaxslam.core.types import Array
 from jaxslam.frontend import automaton, edge_codes, junctions, segmentation, voronoi
 from jaxslam.frontend.automaton import Diagram, EncodedDiagram
 from jaxslam.frontend.config import FrontendConfig, check_config
-from jaxslam.frontend.dropouts import fill_dropouts
+from jaxslam.frontend.dropouts import FilledScan, fill_dropouts
 from jaxslam.frontend.features import find_corners, find_wall_directions
 from jaxslam.frontend.grid import rasterise, seen_free
 from jaxslam.frontend.lidar import begin_behind
@@ -150,10 +150,21 @@ def extract_levels(config: FrontendConfig, scan: Scan) -> tuple[Features, tuple[
         Paper, section 2; `labels="codes"` is its method, with fronts that are diamonds.
     """
     check_config(config)
+    return _extract_filled(config, *_fill(config, scan))
+
+
+def _fill(config: FrontendConfig, scan: Scan) -> tuple[Lidar, FilledScan]:
+    """The scanner with beam 0 behind the robot, and its scan with drop-outs filled."""
     lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
-    levels = config.pyramid()
-    segments = segmentation.find_segments(lidar, config.segments, scan)
-    scan = fill_dropouts(lidar, config.segments, scan).scan
+    return lidar, fill_dropouts(lidar, config.segments, scan)
+
+
+def _extract_filled(
+    config: FrontendConfig, lidar: Lidar, filled: FilledScan
+) -> tuple[Features, tuple[LevelDiagram, ...]]:
+    """`extract_levels` of what `_fill` returns."""
+    levels, scan = config.pyramid(), filled.scan
+    segments = segmentation.segment_filled(lidar, config.segments, filled)
     grown = [grow(config._replace(lidar=lidar), level, scan, segments) for level in levels]
     cells = junction_cells(levels, [own for _, own in grown], [found.sources for found, _ in grown])
     features = concatenate_features(
@@ -174,10 +185,11 @@ def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, L
     Raises:
         ValueError: As of `extract_features`, or there may be more than 31 junctions.
     """
-    features, diagrams = extract_levels(config, scan)
-    lidar, scan = begin_behind(config.lidar, as_scan(config.lidar, scan))
-    scan = fill_dropouts(lidar, config.segments, scan).scan
-    arcs = find_pyramid_arcs(lidar, config.pyramid(), config.features, features, diagrams, scan)
+    check_config(config)
+    lidar, filled = _fill(config, scan)
+    features, diagrams = _extract_filled(config, lidar, filled)
+    levels = config.pyramid()
+    arcs = find_pyramid_arcs(lidar, levels, config.features, features, diagrams, filled.scan)
     return features, arcs
 
 

@@ -84,8 +84,11 @@ def find_segments(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> Segments:
             its scans; while tracing.
     """
     check_segment_spec(spec)
-    scan = as_scan(lidar, scan)
-    filled = fill_dropouts(lidar, spec, scan)
+    return segment_filled(lidar, spec, fill_dropouts(lidar, spec, as_scan(lidar, scan)))
+
+
+def segment_filled(lidar: Lidar, spec: SegmentSpec, filled: FilledScan) -> Segments:
+    """`find_segments` of a scan whose drop-outs are filled already."""
     xy = beam_ends(lidar, filled.scan)
     noise = max(lidar.range_std, 0.005)
     cut = line_fitting.partition_beams(

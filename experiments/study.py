@@ -78,7 +78,7 @@ def variants_of(maps: Path | None, intel: Path | None, metres: float) -> list[Va
         for scanner_name in SCANNERS:
             scanner = scanner_presets.preset(scanner_name)
             robot = Robot(scanner=scanner, scan_period=SCAN_PERIOD)
-            fixed = Config.for_lidar(scanner.lidar()), kinematics.noise_params(robot), robot
+            fixed = Config.for_lidar(scanner.lidar()), kinematics.noise_params(robot, world), robot
             scans = drives.num_scans_of_drive(robot, path)
             for people in PEOPLE:
                 life = living._replace(

@@ -109,7 +109,7 @@ def simulate(
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     simulated, config = _robot(robot, config)
-    params = read_params(noise, kinematics.noise_params(simulated))
+    params = read_params(noise, kinematics.noise_params(simulated, walls))
     given = None
     if goes_wrong is not None:
         with name_errors(str(life)):

@@ -114,7 +114,7 @@ def _variant(
         name,
         shown,
         config,
-        _params(given, robot),
+        _params(given, robot, building.world),
         robot,
         world,
         path,
@@ -186,10 +186,11 @@ def _robot(given: Settings, notes: dict[str, None]) -> tuple[Robot, Config]:
     return robot, Config.for_lidar(lidar, frontend=config.frontend, filter=config.filter)
 
 
-def _params(given: Settings, robot: Robot) -> NoiseParams:
+def _params(given: Settings, robot: Robot, world: World) -> NoiseParams:
     """Q and R that the filter assumes."""
     file = given.get("noise")
-    params = read_params(None if file is None else Path(file), kinematics.noise_params(robot))
+    default = kinematics.noise_params(robot, world)
+    params = read_params(None if file is None else Path(file), default)
     q, r = (given.get(key, 1.0) for key in ("odometry_factor", "sensor_factor"))
     if not (q > 0.0 and r > 0.0):
         raise InputError("odometry_factor and sensor_factor are above 0")

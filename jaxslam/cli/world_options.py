@@ -1,5 +1,6 @@
 """The building and the drive of `jaxslam simulate`, from its options."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,9 +17,11 @@ from jaxslam.io.errors import InputError
 from jaxslam.io.world_files import WorldFile
 from jaxslam.simulation import named_worlds, path_checks, path_following, worlds
 from jaxslam.simulation.buildings import NAME_FORM, PREFIX
+from jaxslam.simulation.wall_directions import direction_std
 from jaxslam.simulation.worlds import World
 
 NEAR = 0.2  # [m] of a wall, where many robots do not fit
+NOT_PARALLEL = math.radians(0.05)  # standard deviation from which on it is said
 BEND = 0.01  # [m] by which waypoints are off the path that is driven
 
 
@@ -85,6 +88,12 @@ def read_building(
         building = world_files.read_world(world, resolution=resolution, unit=unit, layers=layers)
         points = None
     notes = [*building.notes]
+    spread = direction_std(building.world.walls)
+    if spread > NOT_PARALLEL:
+        notes.append(
+            f"long walls are parallel to {math.degrees(spread):.1f} deg (standard deviation), "
+            "which R of a wall's direction has, too"
+        )
     if path is not None:
         points = path_file.read(path) - building.origin
         points = polylines.simplify(points, BEND)

@@ -31,6 +31,8 @@ from jaxslam.core.types import Array
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.simulation import path_following
 from jaxslam.simulation.robot import Robot, arc_increment, true_increment, wheel_std
+from jaxslam.simulation.wall_directions import direction_std
+from jaxslam.simulation.worlds import World
 
 KINEMATICS = ("differential", "ackermann", "holonomic")
 """Known drives, for `Robot.kinematics`."""
@@ -178,8 +180,10 @@ def _resampled(odometry: Array, samples: float) -> Array:
     return jnp.concatenate([zero, jax.vmap(relative)(found[:-1], found[1:])])
 
 
-def noise_params(robot: Robot) -> NoiseParams:
+def noise_params(robot: Robot, world: World | None = None) -> NoiseParams:
     """Noise that the filter assumes for a robot: `NoiseParams.for_simulated_robot`, by its drive.
+
+    In a world whose walls are not quite parallel, R of a wall's direction has their variance, too.
 
     Straight on, and in place, Q is that of the drive; on a curve it is an upper bound. With R the
     smallest radius and m = L / R the largest tangent of the steering angle, an Ackermann drive has
@@ -190,9 +194,22 @@ def noise_params(robot: Robot) -> NoiseParams:
     away from the origin moves sideways with each error of the heading: the part of Q that grows
     with the distance is then `odometry_cov_rate`, in the frame of the scanner.
 
+    Args:
+        robot: The robot.
+        world: Where it drives; None: its walls are parallel, or square to each other.
+
     Raises:
         ValueError: The robot has no noise, of which there is no filter.
     """
+    params = _drive_noise(robot)
+    if world is None:
+        return params
+    std = np.hypot(float(params.wall_angle_std), direction_std(world.walls))
+    return params._replace(wall_angle_std=jnp.asarray(std, float))
+
+
+def _drive_noise(robot: Robot) -> NoiseParams:
+    """`noise_params` in any world."""
     k, base = robot.encoder_noise, robot.wheel_base
     if robot.kinematics == "differential":
         params = NoiseParams.for_simulated_robot(base, k)

@@ -37,7 +37,7 @@ from jaxslam.frontend.grid import seen_free
 from jaxslam.frontend.segments import Segments
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import trials
+from jaxslam.simulation import trial_episodes
 from jaxslam.simulation.ray_casting import cast
 
 FRONTEND_SCANS = 512  # scans at most that the front end is timed on
@@ -58,10 +58,10 @@ def chain(seed: int, num_trials: int, repeats: int) -> tuple[common.Numbers, Sca
     lidar = config.frontend.lidar
     world, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
-    keys = trials.trial_keys(jax.random.key(seed), np.arange(num_trials))
+    keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
 
     def simulate(keys: Key) -> Episode:
-        return trials.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+        return trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
 
     simulated = simulate(keys)
     poses = simulated.truth.reshape(-1, 3)

@@ -20,7 +20,7 @@ from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.motion_model import wheel_coefficients
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import path_following, trials
+from jaxslam.simulation import path_following, trial_episodes
 from jaxslam.simulation.drives import drive, num_scans_of_drive
 from jaxslam.simulation.robot import Robot
 
@@ -74,7 +74,7 @@ def _drives(
         measured = measure(own, params, positions, None, truth, odometry)
         return Episode(truth, odometry, *measured)
 
-    return jax.lax.map(one, trials.trial_keys(key, jnp.arange(num_trials)))
+    return jax.lax.map(one, trial_episodes.trial_keys(key, jnp.arange(num_trials)))
 
 
 def drives(

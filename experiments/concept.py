@@ -22,7 +22,7 @@ from jaxslam.filtering.slam_filter import run_filter
 from jaxslam.frontend import extract
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import drives, trials
+from jaxslam.simulation import drives, trial_episodes, trials
 from jaxslam.simulation.ray_casting import cast
 from jaxslam.simulation.worlds import World
 
@@ -70,7 +70,7 @@ def compute(seed: int) -> common.Numbers:
     truth, result = trials.replay_trial(
         jax.random.key(seed), CONFIG, params, robot, world, path, trial=0, num_scans=num_scans
     )
-    key = trials.trial_keys(jax.random.key(seed), jnp.arange(1))[0]
+    key = trial_episodes.trial_keys(jax.random.key(seed), jnp.arange(1))[0]
     odometry = drives.drive(jax.random.split(key)[0], robot, path, num_scans=num_scans)[1]
     hits, diagram, features = features_of(CONFIG, world, np.asarray(truth)[SCAN])
     graph = result.topological_map

@@ -24,7 +24,7 @@ from jaxslam.filtering.measurement_model import predict_measurement
 from jaxslam.filtering.motion_model import wheel_coefficients
 from jaxslam.filtering.noise import NoiseParams, measurement_cov
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import path_following, trials, worlds
+from jaxslam.simulation import path_following, trial_episodes, worlds
 from jaxslam.simulation.drives import start_pose
 from jaxslam.simulation.robot import Robot
 
@@ -183,7 +183,7 @@ def _drives(
     num_trials: int,
     num_scans: int,
 ) -> Episode:
-    keys = trials.trial_keys(key, jnp.arange(num_trials))
+    keys = trial_episodes.trial_keys(key, jnp.arange(num_trials))
     one = partial(drive, num_scans=num_scans)
     return lax.map(lambda key: one(key, params, path, positions, walls), keys)
 

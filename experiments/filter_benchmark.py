@@ -41,7 +41,7 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend import extract
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import filter_episodes
-from jaxslam.simulation import trials
+from jaxslam.simulation import trial_episodes
 from jaxslam.simulation.ray_casting import cast
 
 C_SOURCE = peer_automata.C_SOURCE.with_name("ekf_limit.c")
@@ -133,8 +133,8 @@ def latency(seed: int, num_trials: int) -> tuple[Numbers, Episode]:
     """
     config = Config()
     world, robot, path, num_scans = drive_in()
-    keys = trials.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    episodes = trials.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+    keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
+    episodes = trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
     episode = jax.tree.map(lambda x: x[0], episodes)
     small = config.filter._replace(max_landmarks=64)
     params, belief = NoiseParams.for_simulated_robot(*robot[:2]), init(small, episode.truth[0])

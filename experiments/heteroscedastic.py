@@ -34,7 +34,7 @@ from jaxslam.frontend.features import FeatureSpec
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import trials
+from jaxslam.simulation import trial_episodes
 from jaxslam.tuning import fitting
 from jaxslam.tuning.losses import innovation_nll, pose_nll
 
@@ -104,7 +104,7 @@ def scans(seed: int, num_trials: int, num_heldout: int, num_scans: int | None) -
     config = Config(
         frontend=FrontendConfig(features=spec), filter=FilterConfig(max_landmarks=LANDMARKS)
     )
-    drives = trials.simulate_episodes(
+    drives = trial_episodes.simulate_episodes(
         jax.random.key(seed),
         config,
         num_trials=num_trials + num_heldout,

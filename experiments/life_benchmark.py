@@ -25,7 +25,7 @@ from jaxslam.simulation import (
     World,
     cast,
     life_in,
-    trials,
+    trial_episodes,
     with_index,
 )
 from jaxslam.simulation.named_worlds import named, named_path
@@ -49,7 +49,7 @@ def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     lidar = config.frontend.lidar
     office, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
-    keys = trials.trial_keys(jax.random.key(seed), np.arange(num_trials))
+    keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
     plain = World(jnp.asarray(named(BUILDING).walls, float))
     indexed = with_index(plain, lidar.range_max)
     patrol = named_path(BUILDING)
@@ -57,7 +57,7 @@ def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     life = life_in(plain, patrol, ranges=RANGES, traffic=TRAFFIC, wheels=WHEELS)
 
     def simulate(world: World, path: Any, life: Life | None = None) -> Episode:
-        return trials.simulate_keys(
+        return trial_episodes.simulate_keys(
             keys, config, robot, world, path, num_scans=num_scans, life=life
         )
 

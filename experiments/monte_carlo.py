@@ -34,7 +34,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.simulation import drives, path_following, trials, worlds
+from jaxslam.simulation import drives, path_following, trial_episodes, worlds
 from jaxslam.simulation.robot import Robot
 from jaxslam.study import kept_trials, processes, runner
 from jaxslam.study.runner import Variant
@@ -142,7 +142,7 @@ def summary(key: Key, results: TrialResult) -> common.Numbers:
 
 def key_data(key: Key, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
     """Data (K, 2) of the keys of the trials with these numbers (K,)."""
-    keys = trials.trial_keys(key, jnp.asarray(numbers, jnp.int32))
+    keys = trial_episodes.trial_keys(key, jnp.asarray(numbers, jnp.int32))
     return np.asarray(jax.random.key_data(keys))
 
 

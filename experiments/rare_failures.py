@@ -37,7 +37,7 @@ from jaxslam.frontend.segments import SegmentSpec
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import path_following, worlds
 from jaxslam.simulation.robot import Robot
-from jaxslam.simulation.trials import trial_keys
+from jaxslam.simulation.trial_episodes import trial_keys
 from jaxslam.study.rare_failures import RareFailure, describe, rare_failure
 from jaxslam.study.runner import Variant
 from jaxslam.study.trials_from_noise import TrialsFromNoise

@@ -37,7 +37,7 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import mrclam
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import trials
+from jaxslam.simulation import trial_episodes
 from jaxslam.tuning import fitting, parameters
 from jaxslam.tuning.losses import Loss, innovation_nll, pose_nll
 
@@ -56,7 +56,7 @@ def office(seed: int, num_trials: int, num_heldout: int) -> noise_search.Task:
     world, robot, path, num_scans = common.drive_in()
     total = num_trials + num_heldout
     key = jax.random.key(seed)
-    drives = trials.simulate_episodes(
+    drives = trial_episodes.simulate_episodes(
         key, config, robot, world, path, num_trials=total, num_scans=num_scans
     )
     train = common.take(drives, slice(num_trials))

@@ -25,8 +25,8 @@ if _TYPE_CHECKING:
     from jaxslam.pipeline.episodes import episode_from_arrays as episode_from_arrays
     from jaxslam.pipeline.episodes import filter_episodes as filter_episodes
     from jaxslam.pipeline.offline import run_slam as run_slam
+    from jaxslam.simulation.trial_episodes import simulate_episodes as simulate_episodes
     from jaxslam.simulation.trials import run_trials as run_trials
-    from jaxslam.simulation.trials import simulate_episodes as simulate_episodes
     from jaxslam.tuning.fitting import tune as tune
     from jaxslam.tuning.standard_errors import standard_errors as standard_errors
 
@@ -47,7 +47,7 @@ _MODULES = {
     "run_filter": "filtering.slam_filter",
     "run_slam": "pipeline.offline",
     "run_trials": "simulation.trials",
-    "simulate_episodes": "simulation.trials",
+    "simulate_episodes": "simulation.trial_episodes",
     "standard_errors": "tuning.standard_errors",
     "step": "filtering.slam_filter",
     "tune": "tuning.fitting",

@@ -19,6 +19,9 @@ from jaxslam.simulation.ray_casting import Leaving
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
+MATCHED = "wheels may slip, or odometry fail"
+"""Why scans are matched by default."""
+
 MAX_POSES = 100  # along a drive, from which beams are followed
 
 

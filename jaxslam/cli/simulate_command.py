@@ -10,7 +10,7 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.life_options import leaving, leaving_note, life_of
+from jaxslam.cli.life_options import MATCHED, leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import OptionalFile, OptionalLength, OutFolder, check_range, name_errors
 from jaxslam.cli.stopwatch import stopwatch
@@ -28,6 +28,7 @@ from jaxslam.pipeline.episodes import TrialResult
 from jaxslam.simulation import drives, kinematics
 from jaxslam.simulation import trials as trials_module
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.wheel_faults import can_fail
 
 OptionalUnit = Annotated[str | None, tyro.conf.arg(metavar="UNIT", help_behavior_hint="")]
 """Option that is a unit of length, or not given."""
@@ -36,6 +37,11 @@ OptionalDrive = Annotated[
     Literal["patrol", "route"] | None, tyro.conf.arg(metavar="KIND", help_behavior_hint="")
 ]
 """Option that names a kind of drive, or none."""
+
+OptionalOdometry = Annotated[
+    Literal["scan", "wheels"] | None, tyro.conf.arg(metavar="SOURCE", help_behavior_hint="")
+]
+"""Option that is a source of odometry, or not given."""
 
 Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")]
 """Option that names layers of a drawing, or none."""
@@ -53,6 +59,7 @@ def simulate(
     noise: OptionalFile = None,
     robot: OptionalFile = None,
     life: OptionalFile = None,
+    odometry: OptionalOdometry = None,
     landmarks: Literal["all", "junctions"] = "all",
     labels: Literal["segments", "codes"] = "segments",
     out: OutFolder = Path("out"),
@@ -86,6 +93,8 @@ def simulate(
             slip, lost odometry and scans; or `typical`, what recorded drives show on average; by
             default ranges have their noise and nothing else does. `jaxslam.io.life_file` documents
             it.
+        odometry: Scan matching fused with wheel odometry (scan), as `run` has it, or wheel odometry
+            alone (wheels); by default scan where life has wheels slip or odometry fail.
         landmarks: Landmark types: all, or only the junctions of the Voronoi diagram (the paper's
             nodes).
         labels: Labels of occupied cells in the Voronoi expansion: straight wall segments, or the
@@ -109,12 +118,16 @@ def simulate(
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     simulated, config = _robot(robot, config)
-    params = read_params(noise, kinematics.noise_params(simulated, walls))
-    given = None
+    given, match_scans = None, odometry == "scan"
     if goes_wrong is not None:
         with name_errors(str(life)):
             walls, given, note = life_of(building, goes_wrong, seed=seed)
         print(f"life: {note}", flush=True)
+        if odometry is None and can_fail(given.wheels):
+            match_scans = True
+            print(f"scans are matched: {MATCHED}", flush=True)
+    default = kinematics.noise_params(simulated, walls, match_scans=match_scans)
+    params = read_params(noise, default)
     lidar = config.frontend.lidar
     open_share = leaving(lidar, walls, simulated, points)
     print(leaving_note(open_share, lidar.range_max), flush=True)
@@ -134,6 +147,7 @@ def simulate(
                 num_trials=trials,
                 num_scans=num_scans,
                 life=given,
+                match_scans=match_scans,
             )
             results = _collect(groups, trials)
         lengths = [log_errors.path_length(poses) for poses in np.asarray(results.truth)]
@@ -146,7 +160,7 @@ def simulate(
         about = key, config, params, simulated, walls, points
         with name_errors(f"{'the drive' if life is None else life}: trial 0"):
             true_poses, result = trials_module.replay_trial(
-                *about, trial=0, num_scans=num_scans, life=given
+                *about, trial=0, num_scans=num_scans, life=given, match_scans=match_scans
             )
         truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli.life_options import LivingWorld, leaving, leaving_note, life_of
+from jaxslam.cli.life_options import MATCHED, LivingWorld, leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import name_errors
 from jaxslam.cli.world_options import Building, read_building
@@ -22,6 +22,7 @@ from jaxslam.simulation import drives, kinematics, scanner_presets
 from jaxslam.simulation.arguments import as_robot
 from jaxslam.simulation.ray_casting import Leaving
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.wheel_faults import can_fail
 from jaxslam.simulation.worlds import World
 from jaxslam.study.runner import Variant, fingerprint
 from jaxslam.study.settings import LIFE, Settings, files_of, with_life
@@ -64,10 +65,15 @@ def prepare(study: StudyFile) -> Prepared:
             slots = max(slots, life_file.number_of_people(_life_in(own), _building(*place).path))
     # All of them draw the same random numbers then, and run the same program.
     lives = any(key in LIFE for own in given for key in own)
+    fails = any(can_fail(life_file.parts(_life_in(own))["wheels"]) for own in given)
+    if fails and not all("odometry" in own for own in given):
+        notes[f"scans are matched: {MATCHED}"] = None
     for (name, settings, cost), all_of_it in zip(study.variants, given, strict=True):
         with name_errors(f"{study.path}: {name}"):
             own = {key: settings[key] for key in study.varied if key in settings}
-            files = files_of(all_of_it, study.path.parent)
+            files = files_of(
+                {"odometry": "scan" if fails else "wheels"} | all_of_it, study.path.parent
+            )
             variant = _variant(
                 name, own, files, slots if lives else None, study.seed, notes
             )._replace(cost=cost)
@@ -103,6 +109,7 @@ def _variant(
         living = _living(place, tuple(wrong.items()), slots, seed)
         world, life = living.world, living.life
         notes |= dict.fromkeys([f"{name}: life: {living.note}"] if wrong else [])
+    match_scans = given["odometry"] == "scan"
     lidar, path = config.frontend.lidar, np.asarray(building.path)
     driven = path.tobytes(), str(path.dtype)
     found = _leaving(lidar, np.asarray(world.walls, float).tobytes(), robot, *driven)
@@ -114,12 +121,13 @@ def _variant(
         name,
         shown,
         config,
-        _params(given, robot, building.world),
+        _params(given, robot, building.world, match_scans=match_scans),
         robot,
         world,
         path,
         _num_scans(robot, *driven),
         life,
+        match_scans=match_scans,
     )
 
 
@@ -186,10 +194,10 @@ def _robot(given: Settings, notes: dict[str, None]) -> tuple[Robot, Config]:
     return robot, Config.for_lidar(lidar, frontend=config.frontend, filter=config.filter)
 
 
-def _params(given: Settings, robot: Robot, world: World) -> NoiseParams:
+def _params(given: Settings, robot: Robot, world: World, *, match_scans: bool) -> NoiseParams:
     """Q and R that the filter assumes."""
     file = given.get("noise")
-    default = kinematics.noise_params(robot, world)
+    default = kinematics.noise_params(robot, world, match_scans=match_scans)
     params = read_params(None if file is None else Path(file), default)
     q, r = (given.get(key, 1.0) for key in ("odometry_factor", "sensor_factor"))
     if not (q > 0.0 and r > 0.0):

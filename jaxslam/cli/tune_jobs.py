@@ -26,7 +26,7 @@ from jaxslam.io.errors import InputError
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.stacking import stack_episodes
-from jaxslam.simulation import drives, named_worlds, trials
+from jaxslam.simulation import drives, named_worlds, trial_episodes
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 from jaxslam.tuning import losses
@@ -104,7 +104,7 @@ def simulated_task(
         num_scans = drives.num_scans_of_drive(robot, path)
         total = num_trials + num_heldout
         print(f"simulating {total} trials of {num_scans} scans, world {world}", flush=True)
-        simulated = trials.simulate_episodes(
+        simulated = trial_episodes.simulate_episodes(
             jax.random.key(seed),
             config,
             robot,

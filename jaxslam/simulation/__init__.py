@@ -26,11 +26,11 @@ from jaxslam.simulation.ray_casting import share_leaving as share_leaving
 from jaxslam.simulation.robot import Robot as Robot
 from jaxslam.simulation.scanners import Scanner as Scanner
 from jaxslam.simulation.traffic import Traffic as Traffic
+from jaxslam.simulation.trial_episodes import simulate_episodes as simulate_episodes
+from jaxslam.simulation.trial_episodes import simulate_keys as simulate_keys
+from jaxslam.simulation.trial_episodes import trial_keys as trial_keys
 from jaxslam.simulation.trials import replay_trial as replay_trial
 from jaxslam.simulation.trials import run_trials as run_trials
-from jaxslam.simulation.trials import simulate_episodes as simulate_episodes
-from jaxslam.simulation.trials import simulate_keys as simulate_keys
-from jaxslam.simulation.trials import trial_keys as trial_keys
 from jaxslam.simulation.wheel_faults import WheelFaults as WheelFaults
 from jaxslam.simulation.worlds import World as World
 from jaxslam.simulation.worlds import scan_poses as scan_poses

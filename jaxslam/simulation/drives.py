@@ -19,6 +19,8 @@ from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import to_scan
+from jaxslam.matching import scan_matching
+from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
 from jaxslam.simulation.drive_draws import SUBSTEPS, Draws, draw_drive
 from jaxslam.simulation.life import Events, Life, scan_life
@@ -173,11 +175,13 @@ def simulate_episode(
     num_scans: int,
     noise_by_incidence: float = 0.0,
     life: Life | None = None,
+    matching: ScanMatchSpec | None = None,
 ) -> Episode:
     """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
 
-    The standard deviation of a range has the factor exp(`noise_by_incidence` times the angle [rad]
-    between its beam and the normal of the wall). It is that of `robot.scanner`, if there is one.
+    Scans are matched, too, if `matching` says by which options. The standard deviation of a range
+    has the factor exp(`noise_by_incidence` times the angle [rad] between its beam and the normal of
+    the wall). It is that of `robot.scanner`, if there is one.
     """
     scan_of, items, odometry = _drive(
         key,
@@ -190,11 +194,30 @@ def simulate_episode(
         life=life,
     )
 
+    return episode_of(config, scan_of, items, odometry, matching=matching)
+
+
+def episode_of(
+    config: FrontendConfig,
+    scan_of: Callable[[tuple], Scan],
+    items: tuple,
+    odometry: Array,
+    *,
+    matching: ScanMatchSpec | None = None,
+) -> Episode:
+    """The episode of a drive whose scans are still to be made, by `drive_and_scan`."""
+    matches = None
+    if matching is not None:
+        # Scan matching takes them in turn, the front end some at a time: they are made before.
+        items = items[0], lax.map(scan_of, items)
+        empty = scan_matching.empty_submap(matching, config.lidar)
+        matches = scan_matching.match_scans(matching, config.lidar, empty, items[1], odometry)[1]
+
     def features(item: tuple) -> Features:
-        return extract.extract_features(config, scan_of(item))
+        return extract.extract_features(config, item[1] if matching else scan_of(item))
 
     extracted = map_batches(features, items, batch_size=extract.SCAN_BATCH)
-    return Episode(truth=items[0], odometry=odometry, features=extracted)
+    return Episode(truth=items[0], odometry=odometry, features=extracted, scan_matches=matches)
 
 
 def simulate_scans(

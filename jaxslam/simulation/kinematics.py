@@ -180,7 +180,9 @@ def _resampled(odometry: Array, samples: float) -> Array:
     return jnp.concatenate([zero, jax.vmap(relative)(found[:-1], found[1:])])
 
 
-def noise_params(robot: Robot, world: World | None = None) -> NoiseParams:
+def noise_params(
+    robot: Robot, world: World | None = None, *, match_scans: bool = False
+) -> NoiseParams:
     """Noise that the filter assumes for a robot: `NoiseParams.for_simulated_robot`, by its drive.
 
     In a world whose walls are not quite parallel, R of a wall's direction has their variance, too.
@@ -197,11 +199,15 @@ def noise_params(robot: Robot, world: World | None = None) -> NoiseParams:
     Args:
         robot: The robot.
         world: Where it drives; None: its walls are parallel, or square to each other.
+        match_scans: Whether odometry is fused with scan matching.
 
     Raises:
         ValueError: The robot has no noise, of which there is no filter.
     """
     params = _drive_noise(robot)
+    if match_scans:
+        matched = NoiseParams.for_laser_log(match_scans=True)
+        params = params._replace(scan_match_std_scale=matched.scan_match_std_scale)
     if world is None:
         return params
     std = np.hypot(float(params.wall_angle_std), direction_std(world.walls))

@@ -12,13 +12,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
-from jaxslam.core.features import Features
 from jaxslam.core.scan import Lidar
 from jaxslam.core.types import Array, Key
-from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
+from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.simulation import drives, kinematics, wheel_faults
 from jaxslam.simulation.drive_draws import LIFE, SUBSTEPS, Draws, LifeDraws
 from jaxslam.simulation.life import Life, draw_events
@@ -88,6 +86,7 @@ def simulate_from_noise(
     *,
     life: Life | None = None,
     mount_error: Array | None = None,
+    matching: ScanMatchSpec | None = None,
 ) -> Episode:
     """One trial of T scans: as `simulate_episode`, from noise that is given.
 
@@ -100,17 +99,14 @@ def simulate_from_noise(
         life: What may go wrong; None: nothing.
         mount_error: (3,) [m, m, rad] pose of the scanner in the frame of the scanner where it is
             thought to be; None: zero.
+        matching: Options by which scans are matched; None: they are not.
     """
     given = config.lidar, robot, world, path
     scan_of, items, odometry = drives.drive_and_scan(
         draws_of(noise, life), *given, life=life, mount_error=mount_error
     )
 
-    def features(item: tuple) -> Features:
-        return extract.extract_features(config, scan_of(item))
-
-    extracted = map_batches(features, items, batch_size=extract.SCAN_BATCH)
-    return Episode(truth=items[0], odometry=odometry, features=extracted)
+    return drives.episode_of(config, scan_of, items, odometry, matching=matching)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))

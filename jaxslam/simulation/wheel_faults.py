@@ -40,6 +40,12 @@ class WheelFaults(NamedTuple):
     carry: Any = 3.0
 
 
+def can_fail(faults: WheelFaults) -> bool:
+    """Whether the odometry may differ from the motion by more than its noise."""
+    causes = faults.slip, faults.carpet, faults.lost, faults.carried
+    return any(float(x) > 0.0 for x in causes)
+
+
 class FaultDraws(NamedTuple):
     """What is drawn once a drive.
 

@@ -35,6 +35,7 @@ class Variant(NamedTuple):
         num_scans: T, scans of a trial.
         life: What may go wrong; None: nothing, and ranges have other numbers than with a life.
         cost: In any currency; None: not known.
+        match_scans: Whether odometry is fused with scan matching.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Variant(NamedTuple):
     num_scans: int
     life: Life | None = None
     cost: float | None = None
+    match_scans: bool = False
 
 
 class Progress(NamedTuple):
@@ -144,6 +146,7 @@ def results_of(
         num_trials=num_trials,
         num_scans=variant.num_scans,
         life=variant.life,
+        match_scans=variant.match_scans,
         first=first,
     )
 
@@ -152,7 +155,7 @@ def program_of(variant: Variant) -> Hashable:
     """What variants have in common for which the same program is compiled."""
     given = variant.world, variant.path, variant.params, variant.life
     leaves, tree = jax.tree.flatten(given)
-    fixed = variant.config, variant.robot, variant.num_scans
+    fixed = variant.config, variant.robot, variant.num_scans, variant.match_scans
     return (*fixed, tree, tuple(np.shape(x) for x in leaves))
 
 
@@ -169,7 +172,7 @@ def fingerprint(variant: Variant, seed: int) -> str:
     Trials of another program are others.
     """
     arrays = jax.tree.leaves((variant.world, variant.path, variant.params, variant.life))
-    fixed = variant.config, variant.robot, variant.num_scans
+    fixed = variant.config, variant.robot, variant.num_scans, variant.match_scans
     text = hashlib.sha256(repr((fixed, seed, trace_cache.version())).encode())
     for x in arrays:
         array = np.asarray(x)

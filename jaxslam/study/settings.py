@@ -19,6 +19,7 @@ TEXTS = {
     "scanner": "name of a scanner",
     "noise": "file of the noise parameters of the filter",
     "life": "file of what goes wrong, or typical, as of `jaxslam simulate --life`",
+    "odometry": "scan (matching, fused with the wheels) or wheels",
     "landmarks": "all or junctions",
     "labels": "segments or codes",
 }
@@ -40,6 +41,7 @@ SETTINGS = (*TEXTS, *NUMBERS, *LIFE)
 
 CHOICES = {
     "drive": ("patrol", "route"),
+    "odometry": ("scan", "wheels"),
     "landmarks": ("all", "junctions"),
     "labels": ("segments", "codes"),
 }

@@ -73,8 +73,11 @@ class TrialErrors:
             seed: Of the noise.
 
         Raises:
-            ValueError: A name is not known, or no factor changes the parameter because it is 0.
+            ValueError: A name is not known, no factor changes the parameter because it is 0, or
+                scans are matched, which cannot be done again for each change.
         """
+        if variant.match_scans:
+            raise ValueError("variant.match_scans is True; sensitivities are known without")
         self.parameters = tuple(parameter_of(variant, name) for name in names)
         self._names = tuple(names)
         self._trials = TrialsFromNoise(variant)

@@ -13,11 +13,12 @@ from jaxslam.core.types import Array, Key
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
+from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
 from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.trial_episodes import trial_keys
 from jaxslam.simulation.trial_noise import TrialNoise, draw_noises, simulate_from_noise
-from jaxslam.simulation.trials import trial_keys
 from jaxslam.simulation.worlds import World
 from jaxslam.study.runner import Variant
 
@@ -71,6 +72,7 @@ class TrialsFromNoise:
         """
         self._variant = variant
         self._score = score
+        self._matching = variant.config.scan_matching if variant.match_scans else None
         world = jax.tree.map(_in_precision, variant.world)
         path = jnp.asarray(variant.path, float)
         self._common = Common(variant.params, world, path, variant.life)
@@ -86,11 +88,11 @@ class TrialsFromNoise:
 
     def score(self, noise: TrialNoise) -> np.ndarray:
         """Scores (B,) of trials with the noise [B]; NaN where the estimate is not finite."""
-        return self.spread(_SCORES, noise, self._score)
+        return self.spread(_SCORES, noise, (self._score, self._matching))
 
     def results(self, noise: TrialNoise) -> TrialResult:
         """Results [B] of trials with the noise [B]."""
-        return self.spread(_RESULTS, noise, self._score)
+        return self.spread(_RESULTS, noise, (self._score, self._matching))
 
     def spread(self, mapped: DeviceMap, noise: TrialNoise, static: Any, *given: Array) -> Any:
         """Results of a function of a group of `EPISODE_BATCH` trials, on all devices.
@@ -126,7 +128,7 @@ def _filter(
     frontend: FrontendConfig,
     config: FilterConfig,
     robot: Robot,
-    score: Score,
+    static: tuple[Score, ScanMatchSpec | None],
     key_type: Any,
     common: Common,
     data: TrialNoise,
@@ -135,7 +137,8 @@ def _filter(
 
     def simulate(one: TrialNoise) -> Any:
         given = frontend, robot, common.world, common.path
-        return simulate_from_noise(with_keys(one, key_type), *given, life=common.life)
+        noise = with_keys(one, key_type)
+        return simulate_from_noise(noise, *given, life=common.life, matching=static[1])
 
     return filter_batch(config, common.params, jax.lax.map(simulate, data))
 
@@ -144,14 +147,14 @@ def _scores(
     frontend: FrontendConfig,
     config: FilterConfig,
     robot: Robot,
-    score: Score,
+    static: tuple[Score, ScanMatchSpec | None],
     key_type: Any,
     common: Common,
     data: TrialNoise,
 ) -> Array:
     """Scores of the trials of a group."""
-    result = _filter(frontend, config, robot, score, key_type, common, data)
-    return jnp.where(result.finite, jax.vmap(score)(result), jnp.nan)
+    result = _filter(frontend, config, robot, static, key_type, common, data)
+    return jnp.where(result.finite, jax.vmap(static[0])(result), jnp.nan)
 
 
 _RESULTS = DeviceMap(_filter, size=1, static=5)

@@ -13,9 +13,10 @@ from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.grid import GridSpec
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import path_following, robot, trials, worlds
+from jaxslam.simulation import path_following, robot, trial_episodes, trials, worlds
 from jaxslam.simulation.drives import drive, num_scans_of_drive
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.trial_episodes import simulate_episodes
 from jaxslam.simulation.worlds import World
 
 STEPS = 6
@@ -156,19 +157,21 @@ def simulated(monkeypatch):
     """Calls of the simulation, which is left out."""
     calls = []
 
-    def simulate(keys, config, robot, world, path, *, num_scans, noise_by_incidence, life):
-        assert noise_by_incidence == 0.0 and life is None
+    def simulate(
+        keys, config, robot, world, path, *, num_scans, noise_by_incidence, life, matching
+    ):
+        assert noise_by_incidence == 0.0 and life is matching is None
         calls.append((keys.shape, robot, world.walls, path, num_scans))
 
-    monkeypatch.setattr(trials, "simulate_keys", simulate)
+    monkeypatch.setattr(trial_episodes, "simulate_drives", simulate)
     monkeypatch.setattr(trials, "_SPREAD_GROUPS", None)
     return calls
 
 
 def test_the_drive_is_by_default_that_of_the_office(simulated, monkeypatch):
-    monkeypatch.setattr(trials, "num_scans_of_drive", lambda robot, path: len(path))
-    trials.simulate_episodes(KEY, CONFIG, num_trials=3)
-    trials.simulate_episodes(KEY, CONFIG, ROBOT, worlds.named("office"), OFFICE, num_trials=3)
+    monkeypatch.setattr(trial_episodes, "num_scans_of_drive", lambda robot, path: len(path))
+    simulate_episodes(KEY, CONFIG, num_trials=3)
+    simulate_episodes(KEY, CONFIG, ROBOT, worlds.named("office"), OFFICE, num_trials=3)
     (shape, robot_, walls, path, num_scans), explicit = simulated
     assert shape == (3,) and robot_ == Robot() and num_scans == len(path) == len(OFFICE)
     np.testing.assert_array_equal(walls, worlds.named("office").walls)
@@ -183,7 +186,7 @@ OFFICE = path_following.densify(worlds.waypoints("office"))
 def test_walls_and_paths_are_lists_or_arrays_of_either_precision(simulated, convert):
     walls, path = (np.float32(x).astype(float) for x in (worlds.named("fig07").walls, PATH))
     given = CONFIG, Robot(np.float32(0.5), 0), World(convert(walls)), convert(path)
-    trials.simulate_episodes(KEY, *given, num_trials=np.int32(2), num_scans=np.int64(4))
+    simulate_episodes(KEY, *given, num_trials=np.int32(2), num_scans=np.int64(4))
     ((shape, robot_, own_walls, own_path, num_scans),) = simulated
     assert (shape, robot_, num_scans) == ((2,), Robot(0.5, 0.0), 4)
     np.testing.assert_array_equal(own_walls, walls)
@@ -227,7 +230,7 @@ DRIVE = {"robot": ROBOT, "world": "fig07", "path": PATH, "num_scans": 4, "num_tr
 def test_a_simulation_that_is_not_possible_is_refused(simulated, changes, line):
     given = {"key": KEY, "config": CONFIG} | DRIVE | changes
     with pytest.raises(ValueError, match=line):
-        trials.simulate_episodes(**given)
+        simulate_episodes(**given)
     with pytest.raises(ValueError, match=line):  # at the call, not at the first result
         trials.run_trials(params=SETTING[1], **given)
     one = {name: x for name, x in given.items() if name != "num_trials"}

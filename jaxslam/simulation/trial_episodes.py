@@ -1,0 +1,186 @@
+"""Simulated drives of one robot in one world, as episodes: one for each trial of an experiment."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxslam.core.episode import Episode
+from jaxslam.core.types import Array, Key, as_count, as_size, check_type
+from jaxslam.frontend.config import FrontendConfig
+from jaxslam.matching.icp import ScanMatchSpec
+from jaxslam.pipeline.arguments import check_config
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import arguments
+from jaxslam.simulation.drives import num_scans_of_drive, simulate_episode
+from jaxslam.simulation.life import Life
+from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.worlds import World
+
+ROBOT = Robot()  # the default one
+
+
+class TrialDrive(NamedTuple):
+    """What is driven, checked.
+
+    Attributes:
+        robot: With its encoder noise.
+        world: The walls.
+        path: (N, 2) [m, world].
+        num_scans: T, number of scans.
+        life: What may go wrong; None: nothing.
+        matching: Options by which scans are matched; None: they are not.
+    """
+
+    robot: Robot
+    world: World
+    path: Array
+    num_scans: int
+    life: Life | None
+    matching: ScanMatchSpec | None
+
+
+def drive_of(
+    key: Key,
+    config: Config,
+    robot: Robot,
+    world: str | World,
+    path: Any,
+    num_scans: int | None,
+    life: Life | None,
+    match_scans: bool,
+) -> TrialDrive:
+    """The drive that the arguments of the functions below describe.
+
+    Raises:
+        ValueError: One of them is not possible; the message names it.
+    """
+    arguments.check_key(key)
+    check_config(config)
+    robot = arguments.as_robot(robot)
+    walls = arguments.as_world(world, config.frontend.lidar.range_max)
+    arguments.check_lidar_of(robot, config.frontend.lidar)
+    points = arguments.as_path(path, world)
+    if life is not None:
+        check_type("life", life, Life, advice=": see jaxslam.simulation.life_in")
+        if len(life.materials) != len(walls.walls):
+            raise ValueError(
+                f"life.materials has {len(life.materials)} walls and world.walls "
+                f"{len(walls.walls)}; make it by jaxslam.simulation.life_in of this world"
+            )
+    check_type("match_scans", match_scans, bool)
+    matching = config.scan_matching if match_scans else None
+    if num_scans is None:
+        steps = num_scans_of_drive(robot, points)
+    else:
+        steps = as_count("num_scans", num_scans)
+    return TrialDrive(robot, walls, points, steps, life, matching)
+
+
+def simulate_keys(
+    keys: Key,
+    config: Config,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+    match_scans: bool = False,
+) -> Episode:
+    """Simulate one trial of `num_scans` scans for each of the keys (B,)."""
+    return simulate_drives(
+        keys,
+        config.frontend,
+        robot,
+        world,
+        path,
+        num_scans=num_scans,
+        noise_by_incidence=noise_by_incidence,
+        life=life,
+        matching=config.scan_matching if match_scans else None,
+    )
+
+
+@partial(
+    jax.jit, static_argnames=("config", "robot", "num_scans", "noise_by_incidence", "matching")
+)
+def simulate_drives(
+    keys: Key,
+    config: FrontendConfig,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+    matching: ScanMatchSpec | None = None,
+) -> Episode:
+    """`simulate_keys`, compiled for front end and scan matching alone."""
+    one = partial(
+        simulate_episode,
+        num_scans=num_scans,
+        noise_by_incidence=noise_by_incidence,
+        life=life,
+        matching=matching,
+    )
+    return lax.map(lambda key: one(key, config, robot, world, path), keys)
+
+
+def trial_keys(key: Key, trials: Array) -> Key:
+    """Keys (B,) of the trials with numbers (B,): each can be repeated without the others."""
+    return jax.vmap(partial(jax.random.fold_in, key))(trials)
+
+
+def simulate_episodes(
+    key: Key,
+    config: Config,
+    robot: Robot = ROBOT,
+    world: str | World = "office",
+    path: Any = None,
+    *,
+    num_trials: int,
+    num_scans: int | None = None,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+    match_scans: bool = False,
+) -> Episode:
+    """Simulate trials 0 to B - 1: drives of a robot along a path, and the features of its scans.
+
+    Args:
+        key: Key of the experiment; trial i has `trial_keys(key, i)`.
+        config: Of the front end.
+        robot: The robot, with its encoder noise.
+        world: Name of the world (`worlds.NAMES`), or its walls.
+        path: (N, 2) [m, world] to drive along, N >= 6; the world's own waypoints, densified, by
+            default.
+        num_trials: B, number of trials.
+        num_scans: T, scans of a trial; to the end of the path by default.
+        noise_by_incidence: [1 / rad] by which the logarithm of the standard deviation of a range
+            grows with the angle between its beam and the normal of the wall.
+        life: What may go wrong, by `life_in`; None: nothing.
+        match_scans: Whether increments by scan matching are added, those of `config.scan_matching`.
+
+    Returns:
+        [B] episodes.
+
+    Raises:
+        ValueError: An argument is not possible; the message says what is expected.
+    """
+    given = drive_of(key, config, robot, world, path, num_scans, life, match_scans)
+    keys = trial_keys(key, jnp.arange(as_count("num_trials", num_trials)))
+    return simulate_drives(
+        keys,
+        config.frontend,
+        given.robot,
+        given.world,
+        given.path,
+        num_scans=given.num_scans,
+        noise_by_incidence=as_size("noise_by_incidence", noise_by_incidence, unit="1 / rad"),
+        life=given.life,
+        matching=given.matching,
+    )

@@ -5,13 +5,15 @@ slip, hang, or repeat old values. A robot is heavy, so then its motion is about 
 scan before to the last one. With the probability o that the wheels are wrong, the pose of the scan
 has the density
 
-    p(pose) = (1 - u) ((1 - o) t(pose; as the wheels say) + o t(pose; as before))
-              + u t(pose; as the wheels say, but backwards)
+    p(pose) = (1 - u) ((1 - o) N(pose; as the wheels say) + o t(pose; as before))
+              + u N(pose; as the wheels say, but backwards)
 
-of Student t distributions, as each is now and then off by several standard deviations. Here o is
-how often of late the scans contradicted the wheels, at least `MIN_OUTLIER`, and `GUESSED_OUTLIER`
-where the log itself says that an increment is a guess. Some robots report the speed without its
-sign; so u is `MIN_OUTLIER` until the wheels first report driving backwards, and then 0.
+of Gaussians for wheels that are right, and a Student t distribution, as a motion changes now and
+then by several standard deviations. Here o is how often of late the scans contradicted the wheels,
+at least `MIN_OUTLIER`, and `GUESSED_OUTLIER` where the log itself says that an increment is a
+guess. Some robots report the speed without its sign, and yet none turns back in a moment: u is
+`MIN_OUTLIER` where the motion backwards is as before, smaller where that is a change, by the tail
+of the same t, and 0 once the wheels have reported driving backwards.
 
 The quick match needs one Gaussian near the right place: what the wheels say and the motion before
 are combined by their information, weighted by 1 - o and o.
@@ -65,6 +67,8 @@ ICP_REACH = (0.2, 0.2)
 LEAST_REVERSE = -0.002
 """[m] increment ahead below which the wheels report driving backwards, not a rounding."""
 
+HEAVY_TAILED = (False, True, False)  # of the hypotheses: wheels, as before, wheels backwards
+
 FIRST_CHANGE = (0.1, 0.1)
 """[m], [rad] usual change before there is any: robots of these logs accelerate by 1 m/s^2."""
 
@@ -98,7 +102,9 @@ class ExpectedMotion(NamedTuple):
 
 
 class PoseHypotheses(NamedTuple):
-    """Density of the pose of a scan before it is matched: a mixture of E Student t distributions.
+    """Density of the pose of a scan before it is matched: a mixture of E distributions.
+
+    Those of the wheels are Gaussian, that of the motion before is a Student t distribution.
 
     Attributes:
         poses: (E, 3) [m, m, rad] their means, in the frame of the submap.
@@ -177,8 +183,15 @@ def pose_hypotheses(history: MotionHistory, wheels: WheelMotion, before: Array) 
     increments = [wheels.increment, history.increment, backwards]
     poses = jnp.stack([compose(before, increment) for increment in increments])
     variances = jnp.stack([wheels.variance, change_variance(history), wheels.variance])
+    change = difference(history.increment, backwards)
+    unsigned *= jnp.exp(student_tail(jnp.sum(change**2 / change_variance(history))))
     weights = jnp.stack([(1.0 - unsigned) * (1.0 - outlier), (1.0 - unsigned) * outlier, unsigned])
     return PoseHypotheses(poses, variances, weights, before[2])
+
+
+def student_tail(square: Array) -> Array:
+    """Logarithm of Student's t density at a squared Mahalanobis distance, relative to its peak."""
+    return -0.5 * (DEGREES_OF_FREEDOM + 3.0) * jnp.log1p(square / DEGREES_OF_FREEDOM)
 
 
 def log_density(hypotheses: PoseHypotheses, pose: Array) -> Array:
@@ -189,7 +202,8 @@ def log_density(hypotheses: PoseHypotheses, pose: Array) -> Array:
     off = jnp.stack([along, across, wrap_angle(off[:, 2])], axis=-1)
     square = jnp.sum(off**2 / hypotheses.variances, axis=-1)
     peak = jnp.log(hypotheses.weights) - 0.5 * jnp.sum(jnp.log(hypotheses.variances), axis=-1)
-    tail = -0.5 * (DEGREES_OF_FREEDOM + 3.0) * jnp.log1p(square / DEGREES_OF_FREEDOM)
+    tail = student_tail(square)
+    tail = jnp.where(jnp.array(HEAVY_TAILED), tail, -0.5 * square)
     logs = peak - jnp.max(peak) + tail
     return jnp.max(logs) + jnp.log(jnp.sum(jnp.exp(logs - jnp.max(logs))))
 

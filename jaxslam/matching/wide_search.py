@@ -4,11 +4,12 @@ The quick match finds what lies near the prediction. Here the pose may be anywhe
 metre and a radian to either side, or of a whole turn where nothing fits. The candidates are refined
 by ICP. Quick match and candidates are compared by
 
-    value = (inliers - contradictions) / 2 - surprise
+    value = (inliers - contradictions) / 2 - surprise / returned
 
 where inliers are the points that lie on surfaces of the submap, contradictions those in space that
 its scans saw to be free, both as fractions; the surprise grows with the distance from where wheels
-or the motion before would have the robot (`motion_prior`).
+or the motion before would have the robot (`motion_prior`). The fewer beams returned, as a fraction,
+the less does it say that many of their points fit.
 
 Where two places have about the same value, the better one is kept, and the information is that of a
 Gaussian with the mean and covariance of both: small in the direction from one to the other. With
@@ -75,12 +76,14 @@ def search_widely(
         prior = PosePrior(start, information)
         return fine_icp(spec, lidar, submap, prior, start, points, hit)
 
+    share = _fraction(jnp.maximum(jnp.sum(hit), 1), jnp.array(hit.size), points.dtype)
+
     def value(match: MatchedPose) -> Array:
         contradicted = contradicted_fraction(
             lidar, surfaces, submap.poses, transform(match.pose, points), hit
         )
         unlikely = correlative.surprise(spec.search, log_density(hypotheses, match.pose))
-        value = (match.inlier_fraction - contradicted) / 2 - unlikely
+        value = (match.inlier_fraction - contradicted) / 2 - unlikely / share
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
     # Begun where the wheels had the robot; then where the motion before has it; then the search;

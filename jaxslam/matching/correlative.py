@@ -56,7 +56,7 @@ class CorrelativeSpec(NamedTuple):
     num_candidates: int = 2
     distinct: tuple[float, float] = (0.5, 0.3)
     score_scale: float = 0.02
-    max_penalty: float = 0.35
+    max_penalty: float = 0.25
 
 
 class Candidates(NamedTuple):

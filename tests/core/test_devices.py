@@ -51,8 +51,8 @@ def test_single_items_are_not_vectorised():
         return jax.lax.cond(item > 0, lambda: common, lambda: -common)
 
     for size, word in [(1, "cond"), (2, "select")]:
-        program = _runner(False).trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr
-        assert word in str(program)
+        run = _runner(False, (signed,), size)
+        assert word in str(run.trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr)
     assert DeviceMap(signed, size=1)(jnp.float64(2.0), jnp.array([1, 0, 3])).tolist() == [2, -2, 2]
 
 

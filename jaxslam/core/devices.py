@@ -23,7 +23,7 @@ XLA_FLAGS = {
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # XLA's older code generator
 
-MAX_PROGRAMS = 8
+MAX_PROGRAMS = 12
 """Compiled programs that a process keeps, those used last.
 
 One for CPUs has up to 3,500 parts in memory, and Linux allows a process 65,530 of them.

@@ -165,7 +165,7 @@ class DeviceMap:
 
         # Arguments to the devices of this process; the others serve the rest of the mesh.
         local = [(k, d) for k, d in enumerate(mesh.devices) if d in mesh.local_devices]
-        on_cpu = local[0][1].platform == "cpu"
+        on_cpu = _is_cpu(local[0][1])
         homes = [local[0][1] if on_cpu else device for _, device in local]
         common_of = {home: jax.device_put(common, home) for home in homes}
         batches_of = [
@@ -202,6 +202,11 @@ class DeviceMap:
             return jax.tree.map(lambda *parts: ordered(parts)[:count], *by_round)
 
         return finish
+
+
+def _is_cpu(device: jax.Device) -> bool:
+    """Whether a device shares its memory with the others of the process."""
+    return device.platform == "cpu"
 
 
 @cache

@@ -110,7 +110,7 @@ def run_timed(
     by_program: dict[Hashable, list[int]] = {}
     for number, variant in enumerate(variants):
         by_program.setdefault(program_of(variant), []).append(number)
-    found = {}
+    found: dict[int, Collected] = {}
     for numbers in by_program.values():
         for number in numbers:
             before = len(found) * num_trials

@@ -127,6 +127,16 @@ def test_devices_of_the_cpu_share_one_compiled_program():
     assert_same(both, alone)
 
 
+def test_devices_with_memory_of_their_own_have_programs_of_their_own(monkeypatch):
+    device_map = DeviceMap(scaled, size=3, static=1)
+    given = 6, {"by": np.float64(0.3)}, jax.tree.map(np.asarray, items(17))
+    shared = device_map(*given, devices=jax.devices()[:2])
+    monkeypatch.setattr(devices, "_is_cpu", lambda device: False)
+    before = live_programs()
+    assert_same(device_map(*given, devices=jax.devices()[:2]), shared)
+    assert live_programs() == before + 1
+
+
 def power_of(exponent, common, item):
     return common * item**exponent
 

@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None) -> int:
 
         def show(progress: Progress) -> None:
             bar.set_description(variants[progress.variant].name, refresh=False)
-            bar.update(progress.variant * args.runs + progress.done - bar.n)
+            bar.update(progress.done_of_all - bar.n)
 
         found = runner.run(variants, num_trials=args.runs, seed=args.seed, callback=show)
     numbers = numbers_of(variants, found, args.seed)

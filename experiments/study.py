@@ -98,7 +98,7 @@ def compute(
 
         def show(progress: Progress) -> None:
             bar.set_description(variants[progress.variant].name[:30], refresh=False)
-            bar.update(progress.variant * num_trials + progress.done - bar.n)
+            bar.update(progress.done_of_all - bar.n)
 
         found = runner.run_timed(
             variants, num_trials=num_trials, seed=seed, folder=folder, callback=show

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from jaxslam.cli.options import OutFolder, check_range
 from jaxslam.cli.study_variants import prepare
 from jaxslam.core.caches import enable_caches
-from jaxslam.core.devices import use_cpu_devices
+from jaxslam.core.devices import MAX_PROGRAMS, use_cpu_devices
 from jaxslam.core.memory import memory_now, peak_memory, release_memory
 from jaxslam.core.types import Metrics
 from jaxslam.io.errors import InputError
@@ -136,7 +136,7 @@ def work(
 
         def show(progress: Progress) -> None:
             bar.set_description(variants[progress.variant].name[:30], refresh=False)
-            bar.update(progress.variant * num_trials + progress.done - bar.n)
+            bar.update(progress.done_of_all - bar.n)
 
         return runner.run_timed(
             variants, num_trials=num_trials, seed=seed, folder=parts, callback=show
@@ -165,7 +165,8 @@ def _print_costs(variants: Sequence[Variant], seed: int, scans: int) -> None:
     per_scan = probe.seconds / (count * first.num_scans)
     expected = per_scan * scans + programs * compiling
     kept = BYTES_PER_SCAN * scans / 2**20
-    most = peak_memory() + (programs - 1) * max(memory_now() - before, 0.0)
+    held = min(programs, MAX_PROGRAMS) - 1
+    most = peak_memory() + held * max(memory_now() - before, 0.0)
     most += kept * (1 + 1 / len(variants))
     print(
         f"about {expected / 60:.1f} minutes on {jax.device_count()} devices: {per_scan * 1e3:.2f} "

@@ -1,9 +1,9 @@
 """Devices: one CPU device per core, and a map of a function over all devices and processes."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache, lru_cache, partial, wraps
 from typing import Any
 
 import jax
@@ -22,6 +22,12 @@ XLA_FLAGS = {
 }
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # XLA's older code generator
+
+MAX_PROGRAMS = 12
+"""Compiled programs that a process keeps, those used last.
+
+One for CPUs has up to 3,500 parts in memory, and Linux allows a process 65,530 of them.
+"""
 
 
 def use_cpu_devices(num_devices: int | None = None) -> None:
@@ -87,10 +93,11 @@ class DeviceMap:
         device 0                 | round 0 | round 1 | round 2 |
         device 1                 | round 0 | round 1 | round 2 |
 
-    Each device has a compiled program of its own, all from the same trace. So the result of an
-    item depends neither on the other items nor on the number of devices or processes, bit for bit
-    where the devices are alike. (One program for several devices, sharded by XLA, is compiled to
-    other roundings than a program for one.) Only where there are fewer items than D * size are
+    CPU devices of a process share their memory, and so one compiled program, which each runs in a
+    thread of its own; other devices have a program each, all from the same trace. So the result of
+    an item depends neither on the other items nor on the number of devices or processes, bit for
+    bit where the devices are alike. (One program for several devices, sharded by XLA, is compiled
+    to other roundings than a program for one.) Only where there are fewer items than D * size are
     batches smaller, and results may differ by rounding.
 
     All processes must call it with the same arguments, and all get the whole result.
@@ -158,24 +165,69 @@ class DeviceMap:
 
         # Arguments to the devices of this process; the others serve the rest of the mesh.
         local = [(k, d) for k, d in enumerate(mesh.devices) if d in mesh.local_devices]
-        common_of = [jax.device_put(common, device) for _, device in local]
-        batches_of = [[batch_on(d, k * rounds + r) for r in range(rounds)] for k, d in local]
+        on_cpu = _is_cpu(local[0][1])
+        homes = [local[0][1] if on_cpu else device for _, device in local]
+        common_of = {home: jax.device_put(common, home) for home in homes}
+        batches_of = [
+            [batch_on(home, k * rounds + r) for r in range(rounds)]
+            for (k, _), home in zip(local, homes, strict=True)
+        ]
 
         program = self._function, *static
-        run = _runner(self._quick)
-        _compile(run, program, common_of, [batches[0] for batches in batches_of])
-        # Dispatch is asynchronous: one batch of every device after the other, so that none idles.
+        firsts = [batches_of[homes.index(home)][0] for home in common_of]
+        run = _runner(self._quick, program, _shapes((common_of[homes[0]], firsts[0])))
+        compiled = _compile(run, program, [*common_of.values()], firsts)
+        run_on = dict(zip(common_of, compiled, strict=True))
+
+        def work(home: jax.Device, batch: Any) -> Any:
+            result = run_on[home](common=common_of[home], items=batch)
+            return jax.block_until_ready(result) if on_cpu else result
+
+        # One batch of every device after the other, so that none idles.
         results = [
-            [run(program, *own) for own in zip(common_of, batches, strict=True)]
+            [
+                _queue(device).submit(work, home, batch)
+                for (_, device), home, batch in zip(local, homes, batches, strict=True)
+            ]
             for batches in zip(*batches_of, strict=True)
         ]
 
         def finish() -> Any:
-            by_round = [_gather(mesh, parts) for parts in results]
+            try:
+                by_round = [_gather(mesh, [one.result() for one in parts]) for parts in results]
+            except BaseException:  # Ctrl-C, too: what is not begun is left out
+                _cancel(results)
+                raise
             ordered = partial(_in_order, devices=mesh.size, size=size)
             return jax.tree.map(lambda *parts: ordered(parts)[:count], *by_round)
 
         return finish
+
+
+def _is_cpu(device: jax.Device) -> bool:
+    """Whether a device shares its memory with the others of the process."""
+    return device.platform == "cpu"
+
+
+@cache
+def _queue(device: jax.Device) -> ThreadPoolExecutor:
+    """The thread of a device, which does what it is given in order.
+
+    Of a single thread XLA would run short programs of several CPU devices one after the other.
+    """
+    return ThreadPoolExecutor(1, thread_name_prefix=f"{device.platform}-{device.id}")
+
+
+def _cancel(results: list[list[Future]]) -> None:
+    for parts in results:
+        for one in parts:
+            one.cancel()
+
+
+def _shapes(arrays: Any) -> Hashable:
+    """Structure, shapes and types of arrays: with other ones a function is another program."""
+    leaves, tree = jax.tree.flatten(arrays)
+    return tree, tuple(map(jax.typeof, leaves))
 
 
 @cache
@@ -199,27 +251,38 @@ def quick_options() -> dict[str, Any]:
     return QUICK
 
 
-@cache
-def _runner(quick: bool) -> trace_cache.CachedJit:
-    """`_run`, jitted."""
+@lru_cache(maxsize=MAX_PROGRAMS)
+def _runner(quick: bool, program: tuple, shapes: Hashable) -> trace_cache.CachedJit:
+    """`_run`, jitted for one program; when it is dropped, what it has compiled is freed.
+
+    Args:
+        quick: Whether to compile quickly.
+        program: The function of a `DeviceMap`, and its static arguments.
+        shapes: `_shapes` of the common record and of the items.
+    """
+
+    @wraps(_run)  # JAX frees what it has compiled of a function with the function
+    def run(program: tuple, common: Any, items: Any) -> Any:
+        return _run(program, common, items)
+
     options = quick_options() if quick else None
-    return trace_cache.jit(_run, static_argnames="program", compiler_options=options or None)
+    return trace_cache.jit(run, static_argnames="program", compiler_options=options or None)
 
 
 def _compile(
     run: trace_cache.CachedJit, program: tuple, common_of: list[Any], batch_of: list[Any]
-) -> None:
-    """Compile `_run` for each device, in parallel: XLA does not hold Python's lock.
+) -> list[Callable[..., Any]]:
+    """Compile `_run` for several devices, in parallel: XLA does not hold Python's lock.
 
-    Tracing and lowering do, and come first. The programs stay in JAX's cache, where the calls of
-    `_run` find them.
+    Tracing and lowering do, and come first. The programs stay in JAX's cache, where the next call
+    finds them.
     """
     lowered = [
-        run.trace(program, common, batch).lower()
+        run.lower(program=program, common=common, items=batch)
         for common, batch in zip(common_of, batch_of, strict=True)
     ]
     with ThreadPoolExecutor(min(len(lowered), num_cores())) as pool:
-        list(pool.map(lambda each: each.compile(), lowered))
+        return list(pool.map(lambda each: each(), lowered))
 
 
 def _run(program: tuple, common: Any, items: Any) -> Any:
@@ -245,16 +308,17 @@ def _gather(mesh: Mesh, parts: list[Any]) -> Any:
         mesh: The D devices.
         parts: The results (size, ...) of those of this process, in the order of the mesh.
     """
+    if jax.process_count() == 1:
+        return jax.tree.map(lambda *x: np.concatenate([np.asarray(one) for one in x]), *parts)
+    local = [device for device in mesh.devices if device in mesh.local_devices]
 
     def sharded(*shards: Array) -> Array:
         sharding = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
         shape = (mesh.size * len(shards[0]), *shards[0].shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, sharding, shards)
+        placed = [jax.device_put(x, device) for x, device in zip(shards, local, strict=True)]
+        return jax.make_array_from_single_device_arrays(shape, sharding, placed)
 
-    result = jax.tree.map(sharded, *parts)
-    if jax.process_count() > 1:
-        return multihost_utils.process_allgather(result, tiled=True)
-    return jax.tree.map(np.asarray, result)
+    return multihost_utils.process_allgather(jax.tree.map(sharded, *parts), tiled=True)
 
 
 def _in_order(by_round: Sequence[np.ndarray], *, devices: int, size: int) -> np.ndarray:

@@ -132,6 +132,20 @@ class CachedJit:
         program, args, kwargs = self._find(args, kwargs)
         return program.trace(*args, **kwargs)
 
+    def lower(self, **arguments: Any) -> Callable[[], Callable[..., Any]]:
+        """Trace and lower the program for such arguments; the result compiles it.
+
+        What that returns takes the arguments that are not static, by name, in any thread.
+        """
+        program, args, kwargs = self._find((), arguments)
+        lowered = program.trace(*args, **kwargs).lower()
+
+        def compiled() -> Callable[..., Any]:
+            ready = lowered.compile()
+            return ready if program is self._plain else lambda **arrays: ready(arrays)
+
+        return compiled
+
     def _find(self, args: tuple, kwargs: dict) -> tuple[jax.stages.Wrapped, tuple, dict]:
         """Program for such arguments, jitted by JAX, and the arguments to call it with."""
         fallback = self._plain, args, kwargs

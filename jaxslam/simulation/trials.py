@@ -119,6 +119,8 @@ def _filter_group(
     return filter_batch(config, common.params, episodes)
 
 
+# Compiled quickly, it would run a third slower, which pays only below some hundred drives of the
+# office; and chosen by the number of trials, a trial would depend on that number.
 _SPREAD_GROUPS = DeviceMap(_filter_group, size=1, static=6)
 
 

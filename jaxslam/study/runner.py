@@ -57,10 +57,12 @@ class Progress(NamedTuple):
     Attributes:
         variant: Number of the variant.
         done: Its trials that are done.
+        done_of_all: Trials of all variants that are done.
     """
 
     variant: int
     done: int
+    done_of_all: int
 
 
 def run(
@@ -103,29 +105,33 @@ def run_timed(
     folder: Path | None = None,
     callback: Callable[[Progress], None] | None = None,
 ) -> list[Collected]:
-    """As `run`; with the outcomes of each variant the seconds and memory that they took."""
-    found = []
-    compiled = set()
+    """As `run`; with the outcomes of each variant the seconds and memory that they took.
+
+    Variants of one program run one after the other, since a process keeps only some programs.
+    """
+    by_program: dict[Hashable, list[int]] = {}
     for number, variant in enumerate(variants):
-        results = partial(_outcomes, variant, seed)
-        program = program_of(variant)
-        found.append(
-            kept_trials.collect(
-                results,
+        by_program.setdefault(program_of(variant), []).append(number)
+    found: dict[int, Collected] = {}
+    for numbers in by_program.values():
+        for number in numbers:
+            before = len(found) * num_trials
+            found[number] = kept_trials.collect(
+                partial(_outcomes, variants[number], seed),
                 Outcomes,
                 num_trials,
                 folder=None if folder is None else folder / f"{number:03d}",
-                mark=fingerprint(variant, seed),
-                warm_up=program not in compiled,
-                callback=None if callback is None else _numbered(callback, number),
+                mark=fingerprint(variants[number], seed),
+                warm_up=number == numbers[0],
+                callback=None if callback is None else _numbered(callback, number, before),
             )
-        )
-        compiled.add(program)
-    return found
+    return [found[number] for number in range(len(variants))]
 
 
-def _numbered(callback: Callable[[Progress], None], number: int) -> Callable[[int], None]:
-    return lambda done: callback(Progress(number, done))
+def _numbered(
+    callback: Callable[[Progress], None], number: int, before: int
+) -> Callable[[int], None]:
+    return lambda done: callback(Progress(number, done, before + done))
 
 
 def _outcomes(variant: Variant, seed: int, num_trials: int, first: int) -> Iterator[Outcomes]:

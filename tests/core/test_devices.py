@@ -1,7 +1,9 @@
+import gc
 import os
 import re
 import subprocess
 import sys
+import threading
 from functools import partial
 
 import jax
@@ -10,7 +12,14 @@ import numpy as np
 import pytest
 
 from jaxslam.core import devices
-from jaxslam.core.devices import DeviceMap, _runner, quick_options, use_cpu_devices
+from jaxslam.core.devices import (
+    MAX_PROGRAMS,
+    DeviceMap,
+    _queue,
+    _runner,
+    quick_options,
+    use_cpu_devices,
+)
 
 
 def assert_same(one, two):
@@ -51,8 +60,8 @@ def test_single_items_are_not_vectorised():
         return jax.lax.cond(item > 0, lambda: common, lambda: -common)
 
     for size, word in [(1, "cond"), (2, "select")]:
-        program = _runner(False).trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr
-        assert word in str(program)
+        run = _runner(False, (signed,), size)
+        assert word in str(run.trace((signed,), jnp.float64(1.0), jnp.arange(size)).jaxpr)
     assert DeviceMap(signed, size=1)(jnp.float64(2.0), jnp.array([1, 0, 3])).tolist() == [2, -2, 2]
 
 
@@ -100,6 +109,89 @@ def test_a_device_map_traces_once_whatever_the_number_of_batches():
     for _ in range(3):
         device_map(jnp.float64(2.0), jnp.arange(8.0))
     assert len(traces) == 1
+
+
+def live_programs():
+    gc.collect()
+    return len(jax.devices()[0].client.live_executables())
+
+
+def test_devices_of_the_cpu_share_one_compiled_program():
+    device_map = DeviceMap(scaled, size=3, static=1)
+    given = 5, {"by": np.float64(0.3)}, jax.tree.map(np.asarray, items(17))
+    _runner.cache_clear()
+    before = live_programs()
+    both = device_map(*given, devices=jax.devices()[:2])
+    alone = device_map(*given, devices=jax.devices()[:1])
+    assert live_programs() == before + 1
+    assert_same(both, alone)
+
+
+def test_devices_with_memory_of_their_own_have_programs_of_their_own(monkeypatch):
+    device_map = DeviceMap(scaled, size=3, static=1)
+    given = 6, {"by": np.float64(0.3)}, jax.tree.map(np.asarray, items(17))
+    shared = device_map(*given, devices=jax.devices()[:2])
+    monkeypatch.setattr(devices, "_is_cpu", lambda device: False)
+    before = live_programs()
+    assert_same(device_map(*given, devices=jax.devices()[:2]), shared)
+    assert live_programs() == before + 1
+
+
+def power_of(exponent, common, item):
+    return common * item**exponent
+
+
+def test_a_process_keeps_a_bounded_number_of_programs():
+    """What is compiled for a CPU takes up memory maps, of which a process has only so many."""
+
+    device_map = DeviceMap(power_of, size=2, static=1)
+    common, given = np.float64(2.0), np.array([1.0, 2.0, 3.0])
+    first = device_map(0, common, given)
+    _runner.cache_clear()
+    before, counts = live_programs(), []
+    for exponent in range(MAX_PROGRAMS + 3):
+        found = device_map(exponent, common, given)
+        np.testing.assert_allclose(found, 2.0 * given**exponent, rtol=1e-15)
+        counts.append(live_programs() - before)
+    assert counts[:MAX_PROGRAMS] == list(range(1, MAX_PROGRAMS + 1))
+    assert counts[MAX_PROGRAMS:] == 3 * [MAX_PROGRAMS]
+    assert_same(device_map(0, common, given), first)  # compiled again
+
+
+def test_devices_work_at_the_same_time(monkeypatch):
+    """Each waits for the other at the end of every batch, which they could not in turn."""
+    both, wait = threading.Barrier(2, timeout=30), jax.block_until_ready
+    monkeypatch.setattr(jax, "block_until_ready", lambda x: [wait(x), both.wait()][0])
+    found = DeviceMap(square, size=1)(2.0, np.arange(6.0), devices=jax.devices()[:2])
+    np.testing.assert_array_equal(found, 2.0 * np.arange(6.0) ** 2)
+
+
+def test_work_that_is_given_up_is_not_begun(monkeypatch):
+    done, go_on, wait = [], threading.Event(), jax.block_until_ready
+
+    def second_waits(x):
+        done.append(wait(x))
+        assert len(done) == 1 or go_on.wait(30)
+        return x
+
+    def interrupted(mesh, parts):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jax, "block_until_ready", second_waits)
+    monkeypatch.setattr(devices, "_gather", interrupted)
+    device = jax.devices()[0]
+    finish = DeviceMap(square, size=1).begin(2.0, np.arange(5.0), devices=[device])
+    with pytest.raises(KeyboardInterrupt):
+        finish()
+    go_on.set()
+    _queue(device).submit(int).result(30)
+    assert len(done) <= 2
+
+
+def test_devices_work_in_the_precision_of_the_caller(single_precision):
+    found = DeviceMap(square, size=2)(np.float32(0.1), np.arange(5, dtype=np.float32))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, 0.1 * np.arange(5.0) ** 2, rtol=1e-6)
 
 
 def square(common, item):

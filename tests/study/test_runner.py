@@ -60,10 +60,26 @@ def test_a_study_that_is_stopped_ends_with_the_same_outcomes(tmp_path, small_fil
     seen = []
     found = run(both, num_trials=10, seed=3, folder=tmp_path, callback=seen.append)
     assert_same(found, whole)
-    assert seen[0] == (0, 10) and {one.variant for one in seen[1:]} == {1}  # the first was done
+    assert seen[0] == (0, 10, 10) and seen[-1] == (1, 10, 20)
+    assert {one.variant for one in seen[1:]} == {1}  # the first was done
     assert_same(run(both, num_trials=10, seed=3, folder=tmp_path), whole)
     np.testing.assert_array_equal(whole[0].place, whole[1].place)  # the same drives
     assert np.any(whole[0].error != whole[1].error)
+
+
+def test_variants_of_one_program_run_one_after_the_other(monkeypatch, tmp_path):
+    """A process keeps only some programs, and each is compiled, and warmed up, once."""
+
+    def collect(results, kind, num_trials, *, folder, warm_up, callback, **_):
+        callback(num_trials)
+        return folder.name, warm_up
+
+    monkeypatch.setattr(kept_trials, "collect", collect)
+    given, seen = [variant(num_scans=4 + k % 2) for k in range(5)], []
+    found = runner.run_timed(given, num_trials=7, seed=0, folder=tmp_path, callback=seen.append)
+    assert found == [(f"{k:03d}", k < 2) for k in range(5)]
+    assert [one.variant for one in seen] == [0, 2, 4, 1, 3]
+    assert [one.done_of_all for one in seen] == [7, 14, 21, 28, 35]
 
 
 def test_trials_of_something_else_are_refused(tmp_path, small_files):

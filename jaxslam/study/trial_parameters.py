@@ -74,7 +74,7 @@ class TrialErrors:
 
         Raises:
             ValueError: A name is not known, no factor changes the parameter because it is 0, or
-                scans are matched, which cannot be done again for each change.
+                scans are matched, of which no change is followed.
         """
         if variant.match_scans:
             raise ValueError("variant.match_scans is True; sensitivities are known without")

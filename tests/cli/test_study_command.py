@@ -138,9 +138,12 @@ def test_several_processes_keep_trials_that_this_one_reads(tmp_path, monkeypatch
         lambda group, work, *given: said.append((work, given)) or [700.0, 600.0],
     )
     kept = [Collected("record", 1.0, 500.0)]
-    monkeypatch.setattr(study_command, "work", lambda *given: kept)
+    own = {"num_trials": 4, "seed": 7, "folder": tmp_path}
+    read = {}
+    monkeypatch.setattr(study_command, "run_shown", lambda _, **given: read.update(given) or kept)
     found = study_command._run(["variant"], 4, 7, tmp_path, group)
     assert found == [Collected("record", 1.0, 1300.0)]  # the memory of both
+    assert read == own
     assert said == [(study_command._share, (["variant"], 4, 7, tmp_path))]
     assert study_command._run(["variant"], 4, 7, tmp_path, group._replace(own=(2,))) is None
 

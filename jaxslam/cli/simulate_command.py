@@ -96,19 +96,24 @@ def simulate(
     check_range("--trials", trials, 1, 10**6)
     check_range("--seed", seed, 0, 2**32 - 1)
     goes_wrong = None if life is None else life_file.read(life)
-    building = read_building(
-        world, path, drive=drive, resolution=resolution, unit=unit, layers=layers
-    )
-    walls, points = building.world, building.path
-    if building.notes:
-        (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
-        print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
-    for note in building.notes:
-        print(f"note: {note}", flush=True)
     config = Config(frontend=FrontendConfig(labels=labels))
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     simulated, config = _robot(robot, config)
+    building = read_building(
+        world,
+        path,
+        drive=drive,
+        resolution=resolution,
+        unit=unit,
+        layers=layers,
+        robot_radius=simulated.radius,
+    )
+    walls, points = building.world, building.path
+    (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
+    print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
+    for note in building.notes:
+        print(f"note: {note}", flush=True)
     params = read_params(noise, kinematics.noise_params(simulated))
     given = None
     if goes_wrong is not None:
@@ -122,7 +127,7 @@ def simulate(
     with folder(out) as out_dir:
         enable_caches()
         with name_errors("--robot"):
-            num_scans = drives.num_scans_of_drive(simulated, points)
+            num_scans = drives.num_scans_of_drive(simulated, points, building.world)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,

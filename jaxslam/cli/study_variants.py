@@ -60,7 +60,8 @@ def prepare(study: StudyFile) -> Prepared:
     slots = 0
     for (name, *_), own in zip(study.variants, given, strict=True):
         with name_errors(f"{study.path}: {name}"):
-            place = _place(files_of(own, study.path.parent))
+            files = files_of(own, study.path.parent)
+            place = _place(files, _robot(files, {})[0])
             slots = max(slots, life_file.number_of_people(_life_in(own), _building(*place).path))
     # All of them draw the same random numbers then, and run the same program.
     lives = any(key in LIFE for own in given for key in own)
@@ -87,9 +88,9 @@ def _variant(
     notes: dict[str, None],
 ) -> Variant:
     """The variant with some settings; adds to the notes. Without slots nothing goes wrong."""
-    place = _place(given)
-    building = _building(*place)
     robot, config = _robot(given, notes)
+    place = _place(given, robot)
+    building = _building(*place)
     notes |= dict.fromkeys(building.notes)
     if given.get("landmarks") == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
@@ -118,14 +119,15 @@ def _variant(
         robot,
         world,
         path,
-        _num_scans(robot, *driven),
+        _num_scans(robot, np.asarray(building.world.walls, float).tobytes(), *driven),
         life,
     )
 
 
-def _place(given: Settings) -> tuple:
-    """What names a building and a drive in it."""
-    return tuple(given.get(key) for key in ("world", "path", "drive", "resolution", "unit"))
+def _place(given: Settings, robot: Robot) -> tuple:
+    """What names a building and a drive in it: settings, and the radius of the robot."""
+    names = ("world", "path", "drive", "resolution", "unit")
+    return *(given.get(key) for key in names), robot.radius
 
 
 def _life_in(given: Settings) -> dict[str, float]:
@@ -140,14 +142,17 @@ def _building(
     drive: str | None,
     resolution: float | None,
     unit: str | None,
+    robot_radius: float,
 ) -> Building:
     file = None if path is None else Path(path)
-    return read_building(world or "office", file, drive=drive, resolution=resolution, unit=unit)
+    options: dict[str, Any] = {"drive": drive, "resolution": resolution, "unit": unit}
+    return read_building(world or "office", file, **options, robot_radius=robot_radius)
 
 
 @lru_cache(maxsize=256)
-def _num_scans(robot: Robot, path: bytes, dtype: str) -> int:
-    return drives.num_scans_of_drive(robot, np.frombuffer(path, dtype).reshape(-1, 2))
+def _num_scans(robot: Robot, walls: bytes, path: bytes, dtype: str) -> int:
+    world = World(np.frombuffer(walls).reshape(-1, 4))
+    return drives.num_scans_of_drive(robot, np.frombuffer(path, dtype).reshape(-1, 2), world)
 
 
 @lru_cache(maxsize=64)

@@ -48,6 +48,7 @@ def read_building(
     resolution: float | None = None,
     unit: str | None = None,
     layers: tuple[str, ...] = (),
+    robot_radius: float = 0.0,
 ) -> Building:
     """The building of `--world` and the drive of `--path`.
 
@@ -59,10 +60,11 @@ def read_building(
         resolution: [m] of a pixel, of a picture.
         unit: Of a drawing.
         layers: Of a drawing that are read; empty for all.
+        robot_radius: [m] of the circle around the robot; 0: not known.
 
     Raises:
         InputError: There is no such world, a file or option is bad, there is no drive, or it leads
-            through walls or out of the building.
+            through walls or out of the building, or so near to walls that the robot does not fit.
     """
     if path is not None and drive is not None:
         raise InputError("is not for a drive that --path gives", field="--drive")
@@ -88,10 +90,12 @@ def read_building(
     if path is not None:
         points = path_file.read(path) - building.origin
         points = polylines.simplify(points, BEND)
-        notes += _check(path, points, building)
+        notes += _check(path, points, building, robot_radius)
     elif drive is not None:
         with name_errors("--drive"):
-            found = named_worlds.found_drive(building.world, drive, building.occupancy)
+            found = named_worlds.found_drive(
+                building.world, drive, building.occupancy, robot_radius=robot_radius
+            )
         walls = World(jnp.asarray(building.world.walls, float))
         notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
         driven = jnp.asarray(found.path, float)
@@ -99,12 +103,15 @@ def read_building(
     elif points is None:
         advice = "add --drive patrol, or --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
         raise InputError("is a file, which has no drive of its own", path=world, advice=advice)
+    elif robot_radius:
+        with name_errors(f"the drive of {world}"):
+            _check_room(points, building.world, robot_radius)
     walls = World(jnp.asarray(building.world.walls, float))
     driven = jnp.asarray(path_following.densify(points), float)
     return Building(walls, driven, tuple(notes), world, building.occupancy)
 
 
-def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
+def _check(file: Path, points: np.ndarray, building: WorldFile, robot_radius: float) -> list[str]:
     """Notes on a drive along waypoints (K, 2) [m, world frame]; InputError if there can be none."""
     x, y = building.origin
     about = f"{file}" if not building.origin.any() else f"{file} (less x {x:.0f}, y {y:.0f} m)"
@@ -115,11 +122,23 @@ def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
             problem = f"starts at x {x:.2f}, y {y:.2f} m, where the map is {kind}"
             raise InputError(problem, path=about, advice="start in free space")
     with name_errors(about):
-        found = path_checks.check_path_in_world(points, building.world)
+        found = _check_room(points, building.world, robot_radius)
     notes = []
     if found.clearance < NEAR:
         notes.append(f"the path comes within {found.clearance:.2f} m of a wall")
     return notes
+
+
+def _check_room(points: np.ndarray, world: World, robot_radius: float) -> path_checks.PathCheck:
+    """What was found along waypoints (K, 2) [m]; ValueError if a robot does not fit there."""
+    found = path_checks.check_path_in_world(points, world)
+    if found.clearance < robot_radius:
+        raise ValueError(
+            f"path comes within {found.clearance:.2f} m of a wall, from waypoint {found.leg + 1} "
+            f"to {found.leg + 2}, and the robot's [body] reaches {robot_radius:.2f} m from its "
+            "middle"
+        )
+    return found
 
 
 def _kind_of_cell(occupancy: OccupancyMap, point: np.ndarray) -> str:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.core import se2_np
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
@@ -19,7 +20,14 @@ from jaxslam.core.types import Array, Key
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import to_scan
-from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
+from jaxslam.simulation import (
+    arguments,
+    kinematics,
+    path_checks,
+    ray_casting,
+    scanners,
+    wheel_faults,
+)
 from jaxslam.simulation.drive_draws import SUBSTEPS, Draws, draw_drive
 from jaxslam.simulation.life import Events, Life, scan_life
 from jaxslam.simulation.robot import Robot
@@ -120,17 +128,24 @@ def drive_as_drawn(
     return poses, kinematics.report_odometry(robot, jnp.pad(odometry, ((1, 0), (0, 0))))
 
 
-def num_scans_of_drive(robot: Robot, path: Any) -> int:
+def num_scans_of_drive(robot: Robot, path: Any, world: World | None = None) -> int:
     """Number of scans on a noise-free drive to the end of a path (N, 2).
+
+    Args:
+        robot: The robot.
+        path: Its path.
+        world: Walls that neither robot nor scanner may go through; None for none.
 
     Raises:
         ValueError: The robot or the path is not possible, the robot does not arrive, or it cannot
-            turn on the spot and leaves the path.
+            turn on the spot and leaves the path; or it goes through a wall.
     """
     points = arguments.as_path(path, None)
     # Neither where the scanner is nor its clock changes how the robot drives.
     still = (0.0, 0.0, 0.0)
-    robot = arguments.as_robot(robot)._replace(mount=still, nominal_mount=still, time_offset=0.0)
+    robot = arguments.as_robot(robot)
+    mount = se2_np.compose(np.array(robot.nominal_mount), np.array(robot.mount))
+    robot = robot._replace(mount=still, nominal_mount=still, time_offset=0.0)
     robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=still)
     robot = robot._replace(odometry_rate=0.0)
     upper_bound = 40 + int(4 * _least_motions(robot, np.asarray(points)))
@@ -143,15 +158,20 @@ def num_scans_of_drive(robot: Robot, path: Any) -> int:
             f"wheel_scales are {robot.wheel_scales}, its wheel_base_scale {robot.wheel_base_scale}"
         )
     radius = kinematics.turning_radius(robot)
+    driven = np.asarray(poses, float)[: 1 + int(moving.sum())]
     if radius:
-        driven = np.asarray(poses)[: 1 + int(moving.sum()), :2]
-        departure = max(np.hypot(*(np.asarray(points) - at[None]).T).min() for at in driven)
+        departure = max(np.hypot(*(np.asarray(points) - at[None, :2]).T).min() for at in driven)
         if departure > MAX_DEPARTURE:
             raise ValueError(
                 f"robot leaves the path by {departure:.2f} m, at most {MAX_DEPARTURE} m are "
                 f"driven: its turning radius is {radius:.2f} m; give a path with wider bends"
             )
-    return 1 + int(moving.sum())
+    if world is not None:
+        path_checks.check_driven_in_world(driven[:, :2], world, "the robot")
+        path_checks.check_driven_in_world(
+            se2_np.compose(driven, mount)[:, :2], world, "the scanner, at its mount,"
+        )
+    return len(driven)
 
 
 def _least_motions(robot: Robot, path: np.ndarray) -> float:

@@ -9,6 +9,8 @@ from jaxslam.core.types import as_float64
 from jaxslam.simulation.nearest_walls import SEAM
 from jaxslam.simulation.worlds import World
 
+TOUCH = 1e-3  # [m] from a wall: corners of drawings are as far apart, and beams of float32 pass
+BEND = 0.01  # [m] by which the line of what was driven may be simplified
 OPEN = 0.5  # of the directions around a point that meet no wall: it is outside
 NUM_POINTS, NUM_BEAMS = 100, 60  # that are tried along a path
 _BLOCK = 2**20  # pairs of legs and walls at once
@@ -19,10 +21,12 @@ class PathCheck(NamedTuple):
 
     Attributes:
         clearance: [m] between the path and the nearest wall.
+        leg: Number of the leg that comes so near, from 0.
         open_share: Share of the beams around the path that meet no wall, whatever their range.
     """
 
     clearance: float
+    leg: int
     open_share: float
 
 
@@ -46,23 +50,63 @@ def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
     share = np.array([_open_share(walls, point) for point in points])
     if share[0] >= OPEN:
         raise ValueError(f"path starts {_outside(points[0], share[0])}")
-    clearance = np.inf
+    nearest = _nearest(path, walls)
+    if nearest.crossing is not None:
+        x, y = nearest.crossing
+        raise ValueError(
+            f"path goes through a wall at x {x:.2f}, y {y:.2f} m, from waypoint "
+            f"{nearest.leg + 1} to {nearest.leg + 2}"
+        )
+    if (share >= OPEN).any():
+        first = int((share >= OPEN).argmax())
+        raise ValueError(f"path leaves the building {_outside(points[first], share[first])}")
+    return PathCheck(nearest.distance, nearest.leg, float(share.mean()))
+
+
+def check_driven_in_world(points: np.ndarray, world: World, what: str) -> None:
+    """Check that what was driven along a path, which can leave it in bends, met no wall.
+
+    Args:
+        points: (T, 2) [m, world frame] where it was at each scan.
+        world: The building.
+        what: What was driven, for the message.
+
+    Raises:
+        ValueError: It went through a wall; the message says where.
+    """
+    line, walls = as_float64("points", points, ("T", 2)), as_float64("walls", world.walls, ("S", 4))
+    found = _nearest(polylines.simplify(line, BEND), walls)
+    if found.crossing is not None:
+        x, y = found.crossing
+        raise ValueError(
+            f"{what} goes through a wall at x {x:.2f}, y {y:.2f} m where the robot follows the "
+            "path; keep the path further from walls"
+        )
+
+
+class _Nearest(NamedTuple):
+    """Where a path comes nearest to walls: its distance [m] and leg; crossing (2,), if it does."""
+
+    distance: float
+    leg: int
+    crossing: np.ndarray | None = None
+
+
+def _nearest(path: np.ndarray, walls: np.ndarray) -> _Nearest:
+    """Where a path (K, 2) first crosses walls (S, 4) or is within `TOUCH`, else is nearest."""
+    found = _Nearest(np.inf, 0)
     block = max(1, _BLOCK // len(walls))
     for top in range(0, len(path) - 1, block):
         legs = np.hstack([path[:-1], path[1:]])[top : top + block]
         crosses, distance = _legs_and_walls(legs, walls)
         if crosses.any():
             first = int(crosses.any(axis=1).argmax())
-            x, y = _first_crossing(legs[first], walls[crosses[first]])
-            raise ValueError(
-                f"path goes through a wall at x {x:.2f}, y {y:.2f} m, from waypoint "
-                f"{top + first + 1} to {top + first + 2}"
-            )
-        clearance = min(clearance, float(distance.min()))
-    if (share >= OPEN).any():
-        first = int((share >= OPEN).argmax())
-        raise ValueError(f"path leaves the building {_outside(points[first], share[first])}")
-    return PathCheck(clearance, float(share.mean()))
+            at = _first_crossing(legs[first], walls[crosses[first]])
+            return _Nearest(0.0, top + first, at)
+        if distance.min() < found.distance:
+            leg = top + int(distance.min(axis=1).argmin())
+            found = _Nearest(float(distance.min()), leg)
+    return found
 
 
 def _outside(point: np.ndarray, share: float) -> str:
@@ -90,13 +134,13 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _legs_and_walls(legs: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether legs (K, 4) and walls (S, 4) meet, (K, S), and the distance between them if not."""
+    """Whether legs (K, 4) and walls (S, 4) meet, (K, S), and the distance between them."""
     a, b = legs[:, None, :2], legs[:, None, 2:]
     c, d = walls[None, :, :2], walls[None, :, 2:]
     sides = _cross(b - a, c - a) * _cross(b - a, d - a), _cross(d - c, a - c) * _cross(d - c, b - c)
     ends = (_distance(a, c, d), _distance(b, c, d), _distance(c, a, b), _distance(d, a, b))
     distance = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
-    return ((sides[0] < 0.0) & (sides[1] < 0.0)) | (distance <= 0.0), distance
+    return ((sides[0] < 0.0) & (sides[1] < 0.0)) | (distance <= TOUCH), distance
 
 
 def _distance(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -112,5 +156,6 @@ def _first_crossing(leg: np.ndarray, walls: np.ndarray) -> np.ndarray:
     along, across = leg[2:] - leg[:2], walls[:, 2:] - walls[:, :2]
     slope = _cross(along[None], across)
     safe = np.where(slope != 0.0, slope, 1.0)
-    share = np.where(slope != 0.0, _cross(walls[:, :2] - leg[:2], across) / safe, 0.0)
+    ends = (walls.reshape(-1, 2, 2) - leg[:2]) @ along / max(float(along @ along), 1e-18)
+    share = np.where(slope != 0.0, _cross(walls[:, :2] - leg[:2], across) / safe, ends.min(axis=1))
     return np.asarray(leg[:2] + np.clip(share.min(), 0.0, 1.0) * along)

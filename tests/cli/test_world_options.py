@@ -11,6 +11,7 @@ from jaxslam.core.maps import OccupancyMap
 from jaxslam.io import ros_map
 from jaxslam.io.errors import InputError
 from jaxslam.simulation import path_following, worlds
+from jaxslam.simulation.path_checks import check_path_in_world
 
 WALLS = "0,0,6,0\n6,0,6,4\n6,4,0,4\n0,4,0,0\n3,0,3,2.5\n"
 
@@ -89,6 +90,25 @@ def test_paths_that_cannot_be_driven_end_with_one_line(plan, tmp_path, capsys, p
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(message, line)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_robot_that_does_not_fit_is_refused(tmp_path, plan):
+    path = path_of(tmp_path, [(1, 1), (1, 3)])
+    assert read_building(str(plan), path, robot_radius=0.9).path[0].tolist() == [1.0, 1.0]
+    for world, file, radius in ((str(plan), path, 1.2), ("office", None, 0.6)):
+        with pytest.raises(
+            InputError, match=rf"within .* the robot's \[body\] reaches {radius}0 m"
+        ):
+            read_building(world, file, robot_radius=radius)
+    with pytest.raises(InputError, match="--drive: .*radius"):
+        read_building("office", drive="patrol", robot_radius=3.0)
+
+
+def test_a_drive_that_is_found_keeps_the_radius_of_the_robot(plan):
+    for radius in (0.3, 0.7):
+        building = read_building(str(plan), drive="patrol", robot_radius=radius)
+        found = check_path_in_world(building.path, building.world)
+        assert radius <= found.clearance < radius + 0.5
 
 
 def test_a_path_through_a_map_starts_in_free_space(tmp_path):

@@ -19,6 +19,7 @@ from jaxslam.simulation.ray_casting import Leaving
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
+NOTHING_SEEN = 0.999  # of the beams along a drive that meet no wall: a robot cannot map there
 MAX_POSES = 100  # along a drive, from which beams are followed
 
 
@@ -88,7 +89,11 @@ def _doors(building: Building) -> np.ndarray:
 
 
 def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
-    """Shares of the beams along a drive (N, 2) [m] that meet no wall."""
+    """Shares of the beams along a drive (N, 2) [m] that meet no wall.
+
+    Raises:
+        InputError: Almost all of them meet none: there is nothing to be mapped.
+    """
     points = np.asarray(path, float)
     count = int(np.clip(float(polylines.length(points)) / robot.max_speed, 2, MAX_POSES))
     even = polylines.resample(points, count)
@@ -96,7 +101,15 @@ def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
     poses = jnp.asarray(np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])]), float)
     for mount in (robot.nominal_mount, robot.mount):
         poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(mount, float))
-    return ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
+    found = ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
+    if found.beyond_range > NOTHING_SEEN:
+        width, height = np.ptp(np.reshape(world.walls, (-1, 2)), axis=0)
+        raise InputError(
+            f"no beam along the drive meets a wall within {lidar.range_max:g} m, the walls span "
+            f"{width:.4g} m x {height:.4g} m",
+            advice="check the unit of the walls, and the scanner's range_max",
+        )
+    return found
 
 
 def leaving_note(found: Leaving, range_max: float) -> str:

@@ -126,6 +126,12 @@ def _check(file: Path, points: np.ndarray, building: WorldFile, robot_radius: fl
     notes = []
     if found.clearance < NEAR:
         notes.append(f"the path comes within {found.clearance:.2f} m of a wall")
+    if building.occupancy is not None:
+        even = path_following.densify(points)
+        unknown = [_kind_of_cell(building.occupancy, at) != "free" for at in even]
+        metres = np.mean(unknown) * polylines.length(points)
+        if metres >= 0.05:
+            notes.append(f"{metres:.1f} m of the path are where the map is unknown")
     return notes
 
 

@@ -77,6 +77,9 @@ def geometries(path: Path, content: Any) -> Iterator[tuple[str, str, dict | None
         if not isinstance(item, dict) or not isinstance(item.get("type"), str):
             problem = "is no object of GeoJSON, with a type"
             raise InputError(problem, path=path, field=field, advice=GEOJSON_ADVICE)
+        if where and item.get("crs") is not None:
+            problem, advice = "has a crs of its own", "give one, at the top of the file"
+            raise InputError(problem, path=path, field=field, advice=advice)
         lists = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
         if item["type"] in lists:
             name = lists[item["type"]]
@@ -180,7 +183,8 @@ def read_csv(path: Path, unit: str | float | None = None) -> Drawing:
     table = size * np.array(values)
     walls = table[:, [names.index(name) for name in ENDS]]
     other = [name for name in names if name not in (*ENDS, THICKNESS)]
-    note = f"columns not read: {', '.join(other)}" if other else ""
+    notes = [f"columns not read: {', '.join(other)}"] if other else []
+    notes += ["numbers are taken as metres"] if unit is None else []
     if THICKNESS in names:
         thickness = table[:, names.index(THICKNESS)]
         if (thickness < 0.0).any():
@@ -190,7 +194,7 @@ def read_csv(path: Path, unit: str | float | None = None) -> Drawing:
                 problem, path=path, line=first, field=THICKNESS, advice="give 0 or more"
             )
         walls = _faces(walls, thickness)
-    return Drawing(walls, {}, (note,) if note else ())
+    return Drawing(walls, {}, tuple(notes))
 
 
 def split_fields(line: bytes) -> list[bytes]:

@@ -59,6 +59,13 @@ def test_the_share_of_beams_that_leave_is_that_of_the_open_angle():
     assert float(leaving(ROUND, World(SQUARE), Robot(), PATH).no_wall) == 0.0
 
 
+def test_a_drive_that_sees_no_wall_is_refused():
+    """As where walls in millimetres are taken as metres."""
+    message = r"no beam along the drive meets a wall within 5 m, the walls span 8000 m x 8000 m; ch"
+    with pytest.raises(InputError, match=message):
+        leaving(ROUND, World(1000.0 * SQUARE), Robot(), PATH + 1000.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -121,7 +121,9 @@ def test_a_path_through_a_map_starts_in_free_space(tmp_path):
     ros_map.write(tmp_path / "map.yaml", OccupancyMap(occupied, free, 0.1, np.zeros(3)))
     world = str(tmp_path / "map.yaml")
     found = read_building(world, path_of(tmp_path, [(1.5, 1.5), (1.5, 2.5)]))
-    assert len(found.world.walls) == 8
+    assert len(found.world.walls) == 8 and found.notes[1:] == ()
+    through = read_building(world, path_of(tmp_path, [(1.5, 2), (4.5, 2), (4.5, 4.5)]))
+    assert through.notes[1] == "1.5 m of the path are where the map is unknown"
     for start, kind in (((0.7, 0.7), "occupied"), ((1.5, 4), "unknown"), ((-1, 1), "left")):
         path = path_of(tmp_path, [start, (1.5, 1.5)])
         with pytest.raises(InputError, match=f"starts at .* m, where the map is {kind}; start in"):

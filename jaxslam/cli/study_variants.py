@@ -180,6 +180,8 @@ def _robot(given: Settings, notes: dict[str, None]) -> tuple[Robot, Config]:
         scanner = scanner_presets.preset(given["scanner"])
         robot = robot._replace(scanner=scanner, scan_period=1.0 / scanner.scan_rate)
         notes |= dict.fromkeys(f"{scanner.name}: {note}" for note in scanner.assumptions())
+    if robot.kinematics == "holonomic" and "encoder_noise" in given:
+        raise InputError("encoder_noise says nothing of a robot that is holonomic")
     robot = as_robot(robot._replace(**{k: given[k] for k in OF_ROBOT if k in given}))
     if robot.scanner is not None and robot.scan_period * robot.scanner.scan_rate < 1.0 - 1e-6:
         raise InputError(

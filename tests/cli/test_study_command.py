@@ -7,6 +7,7 @@ import pytest
 
 from jaxslam.cli import main, study_command, study_variants
 from jaxslam.io.errors import InputError
+from jaxslam.io.robot_file import EXAMPLE
 from jaxslam.study import kept_trials, runner, study_file
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.processes import Group, LostProcessError
@@ -30,6 +31,11 @@ life.people = 4
 def folder(tmp_path, monkeypatch):
     (tmp_path / "p.csv").write_text("1.0,0.9\n2.2,0.9\n")
     (tmp_path / "w.csv").write_text("x1,y1,x2,y2\n0,0,4,0\n4,0,4,4\n4,4,0,4\n0,4,0,0\n")
+    (tmp_path / "big.toml").write_text(EXAMPLE.replace('length = "0.5 m"', 'length = "4 m"'))
+    slides = EXAMPLE.replace("differential", "holonomic").replace("[1.004, 0.998]", "1.004")
+    noise = 'encoder_noise = "4 mm"      # of a wheel, over one metre'
+    slides = slides.replace(noise, 'slip_noise = ["5 mm", "8 mm", "1 deg"]')
+    (tmp_path / "h.toml").write_text(slides)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -65,6 +71,11 @@ def said_of(folder, text, capsys, *more):
         ('path = "p.csv"\nodometry_factor = 0\n', "odometry_factor and sensor_factor are above 0"),
         ('path = "p.csv"\ndrive = "route"\n', "--drive: is not for a drive that --path gives"),
         ('path = "p.csv"\nscan_period = 0\n', "robot.scan_period is 0.0, not above 0"),
+        (
+            'path = "p.csv"\nrobot = "h.toml"\nencoder_noise = 0.01\n',
+            "encoder_noise says nothing of",
+        ),
+        ('path = "p.csv"\nrobot = "big.toml"\n', "p.csv: path comes within"),
         ("life.persons = 2\n", "base: life.persons is not known; did you mean life."),
     ],
 )

@@ -81,6 +81,18 @@ def life_of(
     return LivingWorld(world, life, note)
 
 
+def check_moved_at(life: Life | None, robot: Robot, num_scans: int) -> None:
+    """Raise InputError if furniture is moved only after a drive of T scans has ended."""
+    if life is None or not len(life.movers.before):
+        return
+    moved_at, end = float(life.traffic.moved_at), (num_scans - 1) * robot.scan_period
+    if moved_at > end:
+        raise InputError(
+            f"moved_at is {moved_at:g} s, and the drive ends after {end:.0f} s",
+            advice="give an earlier time",
+        )
+
+
 def _doors(building: Building) -> np.ndarray:
     """Closed doors (D, 4) [m] of a building: known ones, or those between its rooms."""
     if building.name in worlds.NAMES or building.name.startswith(buildings.PREFIX):

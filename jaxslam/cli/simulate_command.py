@@ -10,7 +10,7 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.life_options import leaving, leaving_note, life_of
+from jaxslam.cli.life_options import check_moved_at, leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import OptionalFile, OptionalLength, OutFolder, check_range, name_errors
 from jaxslam.cli.stopwatch import stopwatch
@@ -128,6 +128,8 @@ def simulate(
         enable_caches()
         with name_errors("--robot"):
             num_scans = drives.num_scans_of_drive(simulated, points, building.world)
+        with name_errors(str(life)):
+            check_moved_at(given, simulated, num_scans)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,

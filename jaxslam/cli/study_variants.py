@@ -7,7 +7,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli.life_options import LivingWorld, leaving, leaving_note, life_of
+from jaxslam.cli.life_options import (
+    LivingWorld,
+    check_moved_at,
+    leaving,
+    leaving_note,
+    life_of,
+)
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import name_errors
 from jaxslam.cli.world_options import Building, read_building
@@ -106,6 +112,8 @@ def _variant(
         notes |= dict.fromkeys([f"{name}: life: {living.note}"] if wrong else [])
     lidar, path = config.frontend.lidar, np.asarray(building.path)
     driven = path.tobytes(), str(path.dtype)
+    num_scans = _num_scans(robot, np.asarray(building.world.walls, float).tobytes(), *driven)
+    check_moved_at(life, robot, num_scans)
     found = _leaving(lidar, np.asarray(world.walls, float).tobytes(), robot, *driven)
     if found.beyond_range:
         about = robot.scanner.name if robot.scanner else "the default scanner"
@@ -119,7 +127,7 @@ def _variant(
         robot,
         world,
         path,
-        _num_scans(robot, np.asarray(building.world.walls, float).tobytes(), *driven),
+        num_scans,
         life,
     )
 
@@ -211,8 +219,7 @@ def _params(given: Settings, robot: Robot) -> NoiseParams:
 
 def _check_used(path: Path, given: list[Settings]) -> None:
     """Raise InputError if a setting of what goes wrong says nothing in any variant."""
-    wrong = life_file.unused(map(_life_in, given))
+    wrong = life_file.unused(map(_life_in, given), "life.")
     if wrong is not None:
-        key, other = wrong
-        problem = f"says nothing without life.{other}"
-        raise InputError(problem, path=path, field=f"life.{key}", advice=f"add life.{other}")
+        key, problem, advice = wrong
+        raise InputError(problem, path=path, field=f"life.{key}", advice=advice)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import main
-from jaxslam.cli.life_options import leaving, leaving_note, life_of
+from jaxslam.cli.life_options import check_moved_at, leaving, leaving_note, life_of
 from jaxslam.cli.world_options import Building, read_building
 from jaxslam.core.scan import Lidar
 from jaxslam.io.errors import InputError
@@ -39,6 +39,11 @@ def test_doors_and_furniture_are_found_where_they_are_asked_for():
     np.testing.assert_allclose(moved.world.walls, SQUARE)
     np.testing.assert_allclose(moved.life.movers.before, CHAIR)
     assert len(moved.life.materials) == 4 and float(moved.life.traffic.moved_at) == 9.0
+    robot = Robot(scan_period=0.5)
+    check_moved_at(moved.life, robot, 19)
+    with pytest.raises(InputError, match="moved_at is 9 s, and the drive ends after 8 s; give an"):
+        check_moved_at(moved.life, robot, 17)
+    check_moved_at(found.life, robot, 2)  # nothing is moved, at infinity
     with pytest.raises(
         InputError, match="moved needs loose furniture; none can be moved in a room"
     ):

@@ -63,13 +63,13 @@ def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
     return PathCheck(nearest.distance, nearest.leg, float(share.mean()))
 
 
-def check_driven_in_world(points: np.ndarray, world: World, what: str) -> None:
-    """Check that what was driven along a path, which can leave it in bends, met no wall.
+def check_line_in_world(points: np.ndarray, world: World, what: str) -> None:
+    """Check that a line met no wall: a path, or what was driven along it, which cuts its bends.
 
     Args:
-        points: (T, 2) [m, world frame] where it was at each scan.
+        points: (T >= 2, 2) [m, world frame] of the line.
         world: The building.
-        what: What was driven, for the message.
+        what: What it is, for the message.
 
     Raises:
         ValueError: It went through a wall; the message says where.
@@ -79,8 +79,8 @@ def check_driven_in_world(points: np.ndarray, world: World, what: str) -> None:
     if found.crossing is not None:
         x, y = found.crossing
         raise ValueError(
-            f"{what} goes through a wall at x {x:.2f}, y {y:.2f} m where the robot follows the "
-            "path; keep the path further from walls"
+            f"{what} goes through a wall at x {x:.2f}, y {y:.2f} m; "
+            "keep the path further from walls"
         )
 
 
@@ -95,6 +95,8 @@ class _Nearest(NamedTuple):
 def _nearest(path: np.ndarray, walls: np.ndarray) -> _Nearest:
     """Where a path (K, 2) first crosses walls (S, 4) or is within `TOUCH`, else is nearest."""
     found = _Nearest(np.inf, 0)
+    if not len(walls):
+        return found
     block = max(1, _BLOCK // len(walls))
     for top in range(0, len(path) - 1, block):
         legs = np.hstack([path[:-1], path[1:]])[top : top + block]

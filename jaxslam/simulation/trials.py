@@ -21,7 +21,7 @@ from jaxslam.pipeline.arguments import as_params, check_config
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
 from jaxslam.pipeline.results import SlamResult
-from jaxslam.simulation import arguments
+from jaxslam.simulation import arguments, path_checks
 from jaxslam.simulation.drives import num_scans_of_drive, simulate_episode, simulate_scans
 from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
@@ -68,6 +68,7 @@ def _drive_of(
     walls = arguments.as_world(world, config.frontend.lidar.range_max)
     arguments.check_lidar_of(robot, config.frontend.lidar)
     points = arguments.as_path(path, world)
+    path_checks.check_line_in_world(np.asarray(points), walls, "path")
     if life is not None:
         check_type("life", life, Life, advice=": see jaxslam.simulation.life_in")
         if len(life.materials) != len(walls.walls):
@@ -76,7 +77,7 @@ def _drive_of(
                 f"{len(walls.walls)}; make it by jaxslam.simulation.life_in of this world"
             )
     if num_scans is None:
-        return _Drive(robot, walls, points, num_scans_of_drive(robot, points), life)
+        return _Drive(robot, walls, points, num_scans_of_drive(robot, points, walls), life)
     return _Drive(robot, walls, points, as_count("num_scans", num_scans), life)
 
 

@@ -205,7 +205,11 @@ def test_a_path_with_bends_that_are_too_tight_is_refused():
     "end, mount, message",
     [
         ((3.0, 1.9), 0.0, None),
-        ((2.78, 2.25), 0.0, r"the robot goes through a wall at x 2.78, y 2.[12]\d m where the rob"),
+        (
+            (2.78, 2.25),
+            0.0,
+            r"following the path, the robot goes through a wall at x 2.78, y 2.[12]\d m; keep",
+        ),
         ((3.0, 1.9), 0.8, r"the scanner, at its mount, goes through a wall at x 3.00"),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam.simulation import worlds
-from jaxslam.simulation.path_checks import TOUCH, check_driven_in_world, check_path_in_world
+from jaxslam.simulation.path_checks import TOUCH, check_line_in_world, check_path_in_world
 from jaxslam.simulation.worlds import World, named, outline, polyline
 
 ROOM = World(outline([(0.0, 0.0, 6.0, 4.0)], [(3.0, 0.0, 3.2, 3.0)]))  # a wall from y 0 to 3
@@ -55,9 +55,9 @@ def test_what_was_driven_may_go_through_a_wall_though_its_path_does_not():
     """A turn around the end of a wall is cut: the message says who, and where."""
     path = np.array([[2.9, 1.0], [2.9, 3.2], [3.3, 3.2], [3.3, 1.0]])
     assert check_path_in_world(path, ROOM).clearance == pytest.approx(0.1)
-    check_driven_in_world(path, ROOM, "the cart")
+    check_line_in_world(path, ROOM, "the cart")
     with pytest.raises(ValueError, match=r"the cart goes through a wall at x 3.00, y 2.65 m"):
-        check_driven_in_world(np.delete(path, 2, axis=0), ROOM, "the cart")
+        check_line_in_world(np.delete(path, 2, axis=0), ROOM, "the cart")
 
 
 def test_a_path_may_look_out_of_an_open_building_but_not_leave_it():

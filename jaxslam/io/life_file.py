@@ -107,9 +107,10 @@ MOST = {
     **{"std_scale": 100.0, "std_per_range": 1.0, "std_by_incidence": 10.0, "shared_std": 1.0},
     **{"shared_angle": 2 * math.pi, "resolution": 1.0, "spot": 0.5, "glass_angle": math.pi / 2},
     **{"black_range": 1e3, "people": 1e4, "people_per_metre": 100.0, "speed": 20.0},
+    **{"missing": 0.99, "dropped": 0.99},  # else there is nothing to be mapped
     **{"distance": 20.0, "moved_by": 20.0, "slip_share": 10.0, "carpet_turn": 10.0, "carry": 1e3},
 }
-"""Largest values in SI units, of those keys that are no shares; beyond, the unit is another one."""
+"""Largest values in SI units; beyond them the unit is another one."""
 _MOST = 1e6
 
 
@@ -156,7 +157,7 @@ def number(table: Table, key: str, given: Any) -> float:
     """
     part = SETTINGS[key]
     is_share = key in (*PROBABILITIES.get(part, ()), "moved")
-    low, high = 0.0, 1.0 if is_share else MOST.get(key, _MOST)
+    low, high = 0.0, MOST.get(key, 1.0 if is_share else _MOST)
     if key in POSITIVE.get(part, ()):
         low = 1e-6
     elif key in AT_LEAST_ONE.get(part, ()):

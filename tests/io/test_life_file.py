@@ -50,7 +50,9 @@ def test_what_the_file_takes_the_simulation_takes(tmp_path):
     [
         ("persons = 3\n", "life.toml: life.persons: is an unknown key"),
         ("misssing = 0.1\n", "did you mean missing"),
-        ("missing = 1.5\n", "life.missing: 1.5 is not between 0 and 1"),
+        ("missing = 1.5\n", "life.missing: 1.5 is not between 0 and 0.99"),
+        ("dropped = 1\n", "life.dropped: 1 is not between 0 and 0.99"),
+        ("black = 1.5\n", "life.black: 1.5 is not between 0 and 1"),
         ('missing = "5 m"\n', "life.missing: '5 m' has the unit 'm'; units are %"),
         ('people = 2\nspeed = "3 lb"\n', "life.speed: '3 lb' has the unit 'lb'; units are m/s, cm"),
         ("people = 2.5\n", "life.people: 2.5 is no whole number"),

@@ -204,6 +204,16 @@ def test_waypoints_are_read(tmp_path):
         ("p.csv", "y,x\n1,2\n", ":1: x: 'y' is not a number"),
         ("p.csv", "1,2\n1e9,2\n", "has coordinates beyond 1e.07 m"),
         ("p.geojson", '{"type": "Point", "coordinates": [1, 2]}', "has 0 LineStrings, not one"),
+        (
+            "p.geojson",
+            json.dumps(line([[8.0, 48.0], [8.0, 48.5]])),
+            "may have degrees of .*, or write CSV of metres$",
+        ),
+        (
+            "p.geojson",
+            json.dumps(line([[1, 2], [1, 4]]) | {"crs": crs("EPSG:25832")}),
+            "crs: the unit .* EPSG:25832 is not known; leave crs out if it has metres",
+        ),
         ("none.geojson", None, "does not exist"),
         ("none.csv", None, "does not exist"),
     ],

@@ -81,7 +81,7 @@ def test_samples_fill_their_box_evenly(tmp_path, method):
         ("trials = 2.5\n", "s.toml: trials: is 2.5, not a whole number"),
         ("success_m = true\n", "s.toml: success_m: is True, not a number"),
         ("[base]\nlife.persons = 3\n", "s.toml: base: life.persons is not known"),
-        ("[base]\nlife.missing = 1.5\n", "base.life.missing: 1.5 is not between 0 and 1"),
+        ("[base]\nlife.missing = 1.5\n", "base.life.missing: 1.5 is not between 0 and 0.99"),
         ('[base]\nmax_speed = "fast"\n', "base.max_speed: 'fast' is no speed; write \"1.5 m/s\""),
         ('[base]\ndrive = "zigzag"\n', "base.drive: is 'zigzag', not patrol or route"),
         ("[base]\nworld = 3\n", "base.world: is 3, not name or file of the building"),

@@ -12,6 +12,7 @@ from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.core.types import Array
 from jaxslam.io import path_file, world_files
+from jaxslam.io.drawing import size_of_unit
 from jaxslam.io.errors import InputError
 from jaxslam.io.world_files import WorldFile
 from jaxslam.simulation import named_worlds, path_checks, path_following, worlds
@@ -89,6 +90,9 @@ def read_building(
     notes = [*building.notes]
     if path is not None:
         points = path_file.read(path) - building.origin
+        stated = unit is None and Path(world).suffix.lower() in (".svg", ".dxf")
+        if stated or (unit is not None and size_of_unit(unit) != 1.0):
+            notes.append(f"waypoints of {path} are in metres, whatever the unit of {world}")
         points = polylines.simplify(points, BEND)
         notes += _check(path, points, building, robot_radius)
     elif drive is not None:

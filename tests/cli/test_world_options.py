@@ -62,6 +62,14 @@ def test_what_was_found_on_the_path_is_noted(plan, tmp_path):
     )
 
 
+def test_waypoints_of_a_drawing_in_another_unit_are_in_metres(plan, tmp_path):
+    path = path_of(tmp_path, [(0.4, 0.4), (0.4, 0.9)])
+    found = read_building(str(plan), path, unit="ft")
+    assert found.notes == (f"waypoints of {path} are in metres, whatever the unit of {plan}",)
+    np.testing.assert_allclose(found.path[0], (0.4, 0.4))
+    assert not any("waypoints" in x for x in read_building(str(plan), path).notes)
+
+
 def test_a_path_is_in_the_coordinates_of_the_file(tmp_path):
     shift = np.array([500000.0, 5300000.0])
     rows = np.array([row.split(",") for row in WALLS.split()], float) + np.tile(shift, 2)

@@ -206,8 +206,6 @@ def _params(given: Settings, robot: Robot) -> NoiseParams:
     file = given.get("noise")
     params = read_params(None if file is None else Path(file), kinematics.noise_params(robot))
     q, r = (given.get(key, 1.0) for key in ("odometry_factor", "sensor_factor"))
-    if not (q > 0.0 and r > 0.0):
-        raise InputError("odometry_factor and sensor_factor are above 0")
     changed: dict[str, Any] = {"odometry_coefficients": params.odometry_coefficients * q}
     if params.odometry_cov_rate is not None:
         changed["odometry_cov_rate"] = params.odometry_cov_rate * q**2

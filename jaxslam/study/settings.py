@@ -30,8 +30,8 @@ NUMBERS = {  # kind of `quantities`, least and most, and what it is
     "scan_period": ("time", 0.0, 100.0, "of the robot"),
     "time_offset": ("time", -10.0, 10.0, "of the robot"),
     "wheel_base_scale": ("ratio", 0.0, 5.0, "of the robot"),
-    "odometry_factor": ("ratio", 0.0, 1e3, "on the standard deviations of Q"),
-    "sensor_factor": ("ratio", 0.0, 1e3, "on the standard deviations of R"),
+    "odometry_factor": ("ratio", 1e-3, 1e3, "on the standard deviations of Q"),
+    "sensor_factor": ("ratio", 1e-3, 1e3, "on the standard deviations of R"),
     "max_landmarks": ("number", 1.0, 1e4, "capacity of the filter"),
 }
 LIFE = {f"life.{key}": key for key in life_file.SETTINGS}

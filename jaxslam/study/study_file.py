@@ -93,7 +93,10 @@ def read(path: str | PathLike) -> StudyFile:
         InputError: It cannot be read, holds something else, or asks for what is not possible.
     """
     path = Path(path)
-    given = toml_or_json.read(path, "see jaxslam.study.study_file")
+    advice = "see jaxslam.study.study_file"
+    given = toml_or_json.read(path, advice)
+    if not given:
+        raise InputError("asks for nothing", path=path, advice=advice)
     known = ("trials", "seed", "success_m", "base", "cost", "vary", "variant", "sample")
     for key in given:
         if key not in known:

@@ -68,7 +68,7 @@ def said_of(folder, text, capsys, *more):
         ('path = "p.csv"\nlife.moved = 1\n', "life.moved: says nothing without life.moved_at;"),
         ('path = "p.csv"\nlife = "none.toml"\n', "none.toml: does not exist"),
         ('path = "p.csv"\nscanner = "LDS-01"\nscan_period = 0.05\n', "LDS-01 scans every 0.2 s"),
-        ('path = "p.csv"\nodometry_factor = 0\n', "odometry_factor and sensor_factor are above 0"),
+        ('path = "p.csv"\nodometry_factor = 0\n', "base.odometry_factor: 0 is not between 0.00"),
         ('path = "p.csv"\ndrive = "route"\n', "--drive: is not for a drive that --path gives"),
         ('path = "p.csv"\nscan_period = 0\n', "robot.scan_period is 0.0, not above 0"),
         (

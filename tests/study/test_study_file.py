@@ -120,6 +120,7 @@ def test_samples_fill_their_box_evenly(tmp_path, method):
             "cost.max_speed.100 cm/s: is another cost of 1.0",
         ),
         ("[cost]\nbase = inf\n", "cost.base: is inf, not a number"),
+        ("# nothing yet\n", "s.toml: asks for nothing; see jaxslam.study.study_file"),
         ("variant = []\n", "variant: is no [[variant]]"),
         ('[[variant]]\nname = " "\n', "variant 1.name: ' ' is no text of one line"),
         ('[[variant]]\nname = "a\\nb"\n', "variant 1.name: 'a\\nb' is no text of one line"),

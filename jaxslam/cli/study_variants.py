@@ -61,6 +61,7 @@ def prepare(study: StudyFile) -> Prepared:
     """
     notes: dict[str, None] = {}
     found: dict[str, Variant] = {}
+    alike: dict[str, str] = {}
     given = [with_life(one.settings, study.path.parent) for one in study.variants]
     _check_used(study.path, given)
     slots = 0
@@ -82,6 +83,12 @@ def prepare(study: StudyFile) -> Prepared:
         if mark in found:  # though their settings differ, as of a value that is the default
             raise same_variants(study.path, found[mark].name, name)
         found[mark] = variant
+        without = {f"life.{key}" for key in life_file.silent(_life_in(all_of_it))}
+        text = repr(sorted((k, x) for k, x in all_of_it.items() if k not in without))
+        other = alike.setdefault(text, name)
+        if other != name:
+            note = f"{other!r} and {name!r} have the same trials: what they differ in says nothing"
+            notes[note] = None
     return Prepared(tuple(found.values()), tuple(notes))
 
 

@@ -181,8 +181,7 @@ def unused(
     everywhere = list(all_settings)
     for key, other in NEEDS.items():
         given = [own for own in everywhere if key in own]
-        others = (other, "people_per_metre") if other == "people" else (other,)
-        if given and not any(own.get(name) for own in given for name in others):
+        if given and all(key in silent(own) for own in given):
             name = f"{prefix}{other}"
             if any(other in own for own in given):
                 return key, f"says nothing where {name} is 0", f"give {name} above 0"
@@ -193,6 +192,16 @@ def unused(
             name = f"{prefix}{size}"
             return key, f"says nothing where {name} is 0", f"give {name} above 0"
     return None
+
+
+def silent(settings: Mapping[str, float]) -> set[str]:
+    """Keys that say nothing beside the other ones, as `speed` where `people` is 0."""
+    found = set()
+    for key, other in NEEDS.items():
+        others = (other, "people_per_metre") if other == "people" else (other,)
+        if key in settings and not any(settings.get(name) for name in others):
+            found.add(key)
+    return found
 
 
 def number_of_people(settings: Mapping[str, float], path: Any) -> int:

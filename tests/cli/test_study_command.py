@@ -117,6 +117,19 @@ def test_a_value_that_is_the_default_is_no_other_variant(folder, capsys):
     )
 
 
+def test_variants_that_differ_in_what_says_nothing_are_noted(folder):
+    """All combinations are run, as asked: without people their speed changes nothing."""
+    text = '[base]\npath = "p.csv"\n[vary]\nlife.speed = [1, 2]\nlife.people = [0, 3]\n'
+    (folder / "s.toml").write_text(text)
+    found = study_variants.prepare(study_file.read(folder / "s.toml"))
+    assert len(found.variants) == 4
+    same = [note for note in found.notes if "same trials" in note]
+    assert same == [
+        "'speed 1, people 0' and 'speed 2, people 0' have the same trials: what they differ in says "
+        "nothing"
+    ]
+
+
 def test_a_file_of_life_is_that_of_simulate(folder, capsys):
     (folder / "life.toml").write_text('people = 3\nmissing = "10 %"\n')
     text = '[base]\npath = "p.csv"\nlife = "life.toml"\n[vary]\nlife.missing = [0, 0.2]\n'

@@ -125,8 +125,8 @@ def test_variants_that_differ_in_what_says_nothing_are_noted(folder):
     assert len(found.variants) == 4
     same = [note for note in found.notes if "same trials" in note]
     assert same == [
-        "'speed 1, people 0' and 'speed 2, people 0' have the same trials: what they differ in says "
-        "nothing"
+        "'speed 1, people 0' and 'speed 2, people 0' have the same trials: "
+        "what they differ in says nothing"
     ]
 
 

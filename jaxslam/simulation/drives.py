@@ -167,10 +167,11 @@ def num_scans_of_drive(robot: Robot, path: Any, world: World | None = None) -> i
                 f"driven: its turning radius is {radius:.2f} m; give a path with wider bends"
             )
     if world is not None:
-        scanner = se2_np.compose(driven, mount)
-        for what, moved in (("robot", driven), ("scanner, at its mount,", scanner)):
-            about = f"following the path, the {what}"
-            path_checks.check_line_in_world(moved[:, :2], world, about)
+        about = "following the path, the"
+        path_checks.check_line_in_world(driven[:, :2], world, f"{about} robot")
+        if mount[:2].any():
+            scanner = se2_np.compose(driven, mount)[:, :2]
+            path_checks.check_line_in_world(scanner, world, f"{about} scanner, at its mount,")
     return len(driven)
 
 

@@ -75,13 +75,29 @@ def check_line_in_world(points: np.ndarray, world: World, what: str) -> None:
         ValueError: It went through a wall; the message says where.
     """
     line, walls = as_float64("points", points, ("T", 2)), as_float64("walls", world.walls, ("S", 4))
-    found = _nearest(polylines.simplify(line, BEND), walls)
-    if found.crossing is not None:
-        x, y = found.crossing
-        raise ValueError(
-            f"{what} goes through a wall at x {x:.2f}, y {y:.2f} m; "
-            "keep the path further from walls"
-        )
+    line = polylines.simplify(line, BEND)
+    legs, block = np.hstack([line[:-1], line[1:]]), max(1, _BLOCK // max(1, len(walls)))
+    for top in range(0, len(legs), block):
+        own = legs[top : top + block]
+        leg, wall = np.nonzero(_boxes_touch(own[:, None], walls[None]))
+        meets, _ = _legs_and_walls(own[leg], walls[wall])
+        if meets.any():
+            first = leg[meets].min()
+            x, y = _first_crossing(own[first], walls[wall[meets & (leg == first)]])
+            raise ValueError(
+                f"{what} goes through a wall at x {x:.2f}, y {y:.2f} m; "
+                "keep the path further from walls"
+            )
+
+
+def _boxes_touch(legs: np.ndarray, walls: np.ndarray) -> np.ndarray:
+    """Whether the boxes around legs and walls (..., 4) are within `TOUCH` of each other."""
+    found: np.ndarray | bool = True
+    for axis in (slice(0, None, 2), slice(1, None, 2)):
+        a, b = legs[..., axis], walls[..., axis]
+        found = found & (a.min(axis=-1) - TOUCH <= b.max(axis=-1))
+        found = found & (b.min(axis=-1) - TOUCH <= a.max(axis=-1))
+    return np.asarray(found)
 
 
 class _Nearest(NamedTuple):
@@ -100,7 +116,7 @@ def _nearest(path: np.ndarray, walls: np.ndarray) -> _Nearest:
     block = max(1, _BLOCK // len(walls))
     for top in range(0, len(path) - 1, block):
         legs = np.hstack([path[:-1], path[1:]])[top : top + block]
-        crosses, distance = _legs_and_walls(legs, walls)
+        crosses, distance = _legs_and_walls(legs[:, None], walls[None])
         if crosses.any():
             first = int(crosses.any(axis=1).argmax())
             at = _first_crossing(legs[first], walls[crosses[first]])
@@ -136,9 +152,9 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _legs_and_walls(legs: np.ndarray, walls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether legs (K, 4) and walls (S, 4) meet, (K, S), and the distance between them."""
-    a, b = legs[:, None, :2], legs[:, None, 2:]
-    c, d = walls[None, :, :2], walls[None, :, 2:]
+    """Whether legs and walls (..., 4) meet, (...), and the distance between them."""
+    a, b = legs[..., :2], legs[..., 2:]
+    c, d = walls[..., :2], walls[..., 2:]
     sides = _cross(b - a, c - a) * _cross(b - a, d - a), _cross(d - c, a - c) * _cross(d - c, b - c)
     ends = (_distance(a, c, d), _distance(b, c, d), _distance(c, a, b), _distance(d, a, b))
     distance = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))

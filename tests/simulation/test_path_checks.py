@@ -1,5 +1,7 @@
 """Paths through walls, or out of the building, are refused; others are measured."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -85,9 +87,14 @@ def test_crossings_are_those_of_shapely(seed):
         path = rng.uniform(0.2, 9.8, (4, 2))
         distance = shapely.distance(shapely.LineString(path), lines)
         if distance == 0.0:
-            with pytest.raises(ValueError, match="goes through a wall"):
+            with pytest.raises(ValueError, match="goes through a wall") as of_path:
                 check_path_in_world(path, world)
+            with pytest.raises(ValueError, match="line goes through a wall") as of_line:
+                check_line_in_world(path, world, "line")
+            where = r"at x .* y [\d.]+ m"
+            assert re.findall(where, str(of_line.value)) == re.findall(where, str(of_path.value))
         else:
+            check_line_in_world(path, world, "line")
             assert check_path_in_world(path, world).clearance == pytest.approx(distance)
 
 

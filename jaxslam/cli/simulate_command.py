@@ -130,6 +130,7 @@ def simulate(
             num_scans = drives.num_scans_of_drive(simulated, points, building.world)
         with name_errors(str(life)):
             check_moved_at(given, simulated, num_scans)
+        print(f"{trials} trials of {num_scans} scans", flush=True)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,

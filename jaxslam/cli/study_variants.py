@@ -141,7 +141,7 @@ def _variant(
 
 def _place(given: Settings, robot: Robot) -> tuple:
     """What names a building and a drive in it: settings, and the radius of the robot."""
-    names = ("world", "path", "drive", "resolution", "unit")
+    names = ("world", "path", "drive", "resolution", "unit", "layers")
     return *(given.get(key) for key in names), robot.radius
 
 
@@ -157,10 +157,12 @@ def _building(
     drive: str | None,
     resolution: float | None,
     unit: str | None,
+    layers: str | None,
     robot_radius: float,
 ) -> Building:
     file = None if path is None else Path(path)
     options: dict[str, Any] = {"drive": drive, "resolution": resolution, "unit": unit}
+    options["layers"] = tuple(x.strip() for x in (layers or "").split(",") if x.strip())
     return read_building(world or "office", file, **options, robot_radius=robot_radius)
 
 

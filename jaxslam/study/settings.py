@@ -15,6 +15,7 @@ TEXTS = {
     "path": "file of waypoints",
     "drive": "patrol or route",
     "unit": "unit of a drawing",
+    "layers": "names of the layers of a drawing whose lines are walls, parted by commas",
     "robot": "file of the robot",
     "scanner": "name of a scanner",
     "noise": "file of the noise parameters of the filter",

@@ -109,6 +109,23 @@ def test_variants_have_the_settings_of_the_study(folder):
     assert study_variants.prepare(study_file.read(folder / "s.toml")).variants[0].life is None
 
 
+def test_layers_of_a_drawing_are_those_of_simulate(folder, capsys):
+    def line(layer, *points):
+        shape = {"type": "LineString", "coordinates": points}
+        return {"type": "Feature", "properties": {"layer": layer}, "geometry": shape}
+
+    walls = line("walls", [0, 0], [4, 0], [4, 4], [0, 4], [0, 0])
+    lines = [walls, line("axes", [1.5, 0], [1.5, 4]), line("door", [3, 0], [3, 1])]
+    content = {"type": "FeatureCollection", "features": lines}
+    (folder / "w.geojson").write_text(json.dumps(content))
+    text = '[base]\nworld = "w.geojson"\npath = "p.csv"\n'
+    assert "path goes through a wall at x 1.50" in said_of(folder, text, capsys)
+    (folder / "s.toml").write_text(text + 'layers = "walls, door"\n')
+    (found,) = study_variants.prepare(study_file.read(folder / "s.toml")).variants
+    assert len(found.world.walls) == 5
+    assert "'wall' is no layer" in said_of(folder, text + 'layers = "wall"\n', capsys)
+
+
 def test_a_value_that_is_the_default_is_no_other_variant(folder, capsys):
     base = '[base]\npath = "p.csv"\n[[variant]]\nname = "as it is"\n'
     other = '[[variant]]\nname = "so fast"\nmax_speed = 0.6\n'

@@ -20,6 +20,7 @@ from jaxslam.simulation.buildings import NAME_FORM, PREFIX
 from jaxslam.simulation.worlds import World
 
 NEAR = 0.2  # [m] of a wall, where many robots do not fit
+PART = 0.25  # of a building: a drive that sees no more may be inside of a column or a cabinet
 BEND = 0.01  # [m] by which waypoints are off the path that is driven
 
 
@@ -128,6 +129,12 @@ def _check(file: Path, points: np.ndarray, building: WorldFile, robot_radius: fl
     with name_errors(about):
         found = _check_room(points, building.world, robot_radius)
     notes = []
+    whole = np.ptp(np.reshape(building.world.walls, (-1, 2)), axis=0)
+    if found.seen.prod() < PART * whole.prod():
+        (width, height), (x, y) = found.seen, whole
+        notes.append(
+            f"around the path walls enclose {width:.1f} m x {height:.1f} m of {x:.1f} m x {y:.1f} m"
+        )
     if found.clearance < NEAR:
         notes.append(f"the path comes within {found.clearance:.2f} m of a wall")
     if building.occupancy is not None:

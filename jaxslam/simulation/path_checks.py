@@ -23,11 +23,13 @@ class PathCheck(NamedTuple):
         clearance: [m] between the path and the nearest wall.
         leg: Number of the leg that comes so near, from 0.
         open_share: Share of the beams around the path that meet no wall, whatever their range.
+        seen: (2,) [m] width and height of the box around all that these beams meet.
     """
 
     clearance: float
     leg: int
     open_share: float
+    seen: np.ndarray
 
 
 def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
@@ -47,7 +49,8 @@ def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
     path, walls = as_float64("path", path, ("K", 2)), as_float64("walls", world.walls, ("S", 4))
     count = max(2, min(NUM_POINTS, int(np.ceil(float(polylines.length(path))))))
     points = polylines.resample(path, count)
-    share = np.array([_open_share(walls, point) for point in points])
+    around = [_meets(walls, point) for point in points]
+    share = np.array([1.0 - len(met) / NUM_BEAMS for met in around])
     if share[0] >= OPEN:
         raise ValueError(f"path starts {_outside(points[0], share[0])}")
     nearest = _nearest(path, walls)
@@ -60,7 +63,8 @@ def check_path_in_world(path: np.ndarray, world: World) -> PathCheck:
     if (share >= OPEN).any():
         first = int((share >= OPEN).argmax())
         raise ValueError(f"path leaves the building {_outside(points[first], share[first])}")
-    return PathCheck(nearest.distance, nearest.leg, float(share.mean()))
+    seen = np.ptp(np.concatenate(around), axis=0)
+    return PathCheck(nearest.distance, nearest.leg, float(share.mean()), seen)
 
 
 def check_line_in_world(points: np.ndarray, world: World, what: str) -> None:
@@ -134,16 +138,18 @@ def _outside(point: np.ndarray, share: float) -> str:
     return f"{place}: {share:.0%} of all directions meet no wall"
 
 
-def _open_share(walls: np.ndarray, point: np.ndarray) -> float:
-    """Share of the directions around a point (2,) that meet none of the walls (S, 4)."""
+def _meets(walls: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Points (M, 2) in which those of the beams around a point (2,) that meet a wall first do."""
     angle = 2.0 * np.pi / NUM_BEAMS * (np.arange(NUM_BEAMS) + 0.5)
-    beam = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
+    beam = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     start, along = walls[:, :2] - point, walls[:, 2:] - walls[:, :2]
-    slope = _cross(beam, along)
+    slope = _cross(beam[:, None], along)
     safe = np.where(np.abs(slope) > 1e-12, slope, 1.0)
-    fraction, distance = _cross(start, beam) / safe, _cross(start, along) / safe
+    fraction, distance = _cross(start, beam[:, None]) / safe, _cross(start, along) / safe
     met = (np.abs(slope) > 1e-12) & (distance > 0.0) & (np.abs(fraction - 0.5) <= 0.5 + SEAM)
-    return 1.0 - float(met.any(axis=1).mean())
+    nearest = np.where(met, distance, np.inf).min(axis=1, initial=np.inf)
+    found = np.isfinite(nearest)
+    return np.asarray(point + nearest[found, None] * beam[found])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -62,6 +62,15 @@ def test_what_was_found_on_the_path_is_noted(plan, tmp_path):
     )
 
 
+def test_a_drive_inside_of_a_column_is_noted(plan, tmp_path):
+    with open(plan, "a") as file:
+        file.write("0.5,0.5,2,0.5\n2,0.5,2,2\n2,2,0.5,2\n0.5,2,0.5,0.5\n")
+    inside = read_building(str(plan), path_of(tmp_path, [(1, 1), (1.6, 1), (1.6, 1.6)]))
+    assert inside.notes[-1] == "around the path walls enclose 1.5 m x 1.5 m of 6.0 m x 4.0 m"
+    outside = read_building(str(plan), path_of(tmp_path, [(2.5, 1), (2.5, 3)]))
+    assert not any("enclose" in note for note in outside.notes)
+
+
 def test_waypoints_of_a_drawing_in_another_unit_are_in_metres(plan, tmp_path):
     path = path_of(tmp_path, [(0.4, 0.4), (0.4, 0.9)])
     found = read_building(str(plan), path, unit="ft")

@@ -22,6 +22,9 @@ def test_clearance_is_the_distance_of_the_nearest_wall():
     assert check_path_in_world([[1, 1], [1, 2.5]], ROOM).clearance == pytest.approx(1.0)
     found = check_path_in_world([[1, 2], [1, 3.5], [2, 3.5], [5, 3.6]], ROOM)
     assert found.clearance == pytest.approx(0.4) and found.leg == 2  # below y 4
+    np.testing.assert_allclose(found.seen, (6.0, 4.0))
+    alcove = check_path_in_world([[1, 1], [1, 1.6]], ROOM).seen  # the wall hides what is behind
+    assert alcove[0] < 6.0 and alcove[1] == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments import common
 from jaxslam.core.caches import enable_caches
@@ -26,9 +25,9 @@ from jaxslam.simulation.life import life_in
 from jaxslam.simulation.range_errors import RangeErrors
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.traffic import Traffic
-from jaxslam.study import runner
 from jaxslam.study.outcomes import Outcomes, position_rmse
-from jaxslam.study.runner import Progress, Variant
+from jaxslam.study.progress import run_shown
+from jaxslam.study.runner import Variant
 
 NAME = "paired_trials"
 MAX_PEOPLE = 10
@@ -136,14 +135,8 @@ def main(argv: list[str] | None = None) -> int:
     use_cpu_devices()
     enable_caches()
     variants = variants_of(args.steps)
-    with tqdm(total=len(variants) * args.runs, unit="trial", desc="compiling") as bar:
-
-        def show(progress: Progress) -> None:
-            bar.set_description(variants[progress.variant].name, refresh=False)
-            bar.update(progress.done_of_all - bar.n)
-
-        found = runner.run(variants, num_trials=args.runs, seed=args.seed, callback=show)
-    numbers = numbers_of(variants, found, args.seed)
+    found = run_shown(variants, num_trials=args.runs, seed=args.seed)
+    numbers = numbers_of(variants, [one.record for one in found], args.seed)
     common.save(args.out, NAME, numbers, draw)
     print("\n".join(_table(numbers["rows"])))
     return 0

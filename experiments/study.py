@@ -15,7 +15,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from experiments import common
 from jaxslam.core import polylines
@@ -28,9 +27,10 @@ from jaxslam.simulation import drives, kinematics, named_worlds, scanner_presets
 from jaxslam.simulation.life import life_in
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
-from jaxslam.study import reporting, runner
+from jaxslam.study import reporting
 from jaxslam.study.kept_trials import Collected
-from jaxslam.study.runner import Progress, Variant
+from jaxslam.study.progress import run_shown
+from jaxslam.study.runner import Variant
 from jaxslam.study.wording import findings
 
 NAME = "study"
@@ -94,15 +94,7 @@ def compute(
     variants: list[Variant], num_trials: int, seed: int, success: float, folder: Path | None
 ) -> common.Numbers:
     """The numbers of the study, with what its figure needs."""
-    with tqdm(total=len(variants) * num_trials, unit="trial", desc="compiling") as bar:
-
-        def show(progress: Progress) -> None:
-            bar.set_description(variants[progress.variant].name[:30], refresh=False)
-            bar.update(progress.done_of_all - bar.n)
-
-        found = runner.run_timed(
-            variants, num_trials=num_trials, seed=seed, folder=folder, callback=show
-        )
+    found = run_shown(variants, num_trials=num_trials, seed=seed, folder=folder)
     return numbers_of(variants, found, seed, success)
 
 

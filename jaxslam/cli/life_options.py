@@ -22,6 +22,7 @@ from jaxslam.simulation.worlds import World
 MATCHED = "wheels may slip, or odometry fail"
 """Why scans are matched by default."""
 
+NOTHING_SEEN = 0.999  # of the beams along a drive that meet no wall: a robot cannot map there
 MAX_POSES = 100  # along a drive, from which beams are followed
 
 
@@ -83,6 +84,18 @@ def life_of(
     return LivingWorld(world, life, note)
 
 
+def check_moved_at(life: Life | None, robot: Robot, num_scans: int) -> None:
+    """Raise InputError if furniture is moved only after a drive of T scans has ended."""
+    if life is None or not len(life.movers.before):
+        return
+    moved_at, end = float(life.traffic.moved_at), (num_scans - 1) * robot.scan_period
+    if moved_at > end:
+        raise InputError(
+            f"moved_at is {moved_at:g} s, and the drive ends after {end:.0f} s",
+            advice="give an earlier time",
+        )
+
+
 def _doors(building: Building) -> np.ndarray:
     """Closed doors (D, 4) [m] of a building: known ones, or those between its rooms."""
     if building.name in worlds.NAMES or building.name.startswith(buildings.PREFIX):
@@ -91,7 +104,11 @@ def _doors(building: Building) -> np.ndarray:
 
 
 def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
-    """Shares of the beams along a drive (N, 2) [m] that meet no wall."""
+    """Shares of the beams along a drive (N, 2) [m] that meet no wall.
+
+    Raises:
+        InputError: Almost all of them meet none: there is nothing to be mapped.
+    """
     points = np.asarray(path, float)
     count = int(np.clip(float(polylines.length(points)) / robot.max_speed, 2, MAX_POSES))
     even = polylines.resample(points, count)
@@ -99,7 +116,15 @@ def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
     poses = jnp.asarray(np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])]), float)
     for mount in (robot.nominal_mount, robot.mount):
         poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(mount, float))
-    return ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
+    found = ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
+    if found.beyond_range > NOTHING_SEEN:
+        width, height = np.ptp(np.reshape(world.walls, (-1, 2)), axis=0)
+        raise InputError(
+            f"no beam along the drive meets a wall within {lidar.range_max:g} m, the walls span "
+            f"{width:.4g} m x {height:.4g} m",
+            advice="check the unit of the walls, and the scanner's range_max",
+        )
+    return found
 
 
 def leaving_note(found: Leaving, range_max: float) -> str:

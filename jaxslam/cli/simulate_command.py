@@ -10,7 +10,7 @@ import tyro
 from tqdm import tqdm
 
 from jaxslam.cli import report, summaries
-from jaxslam.cli.life_options import MATCHED, leaving, leaving_note, life_of
+from jaxslam.cli.life_options import MATCHED, check_moved_at, leaving, leaving_note, life_of
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import OptionalFile, OptionalLength, OutFolder, check_range, name_errors
 from jaxslam.cli.stopwatch import stopwatch
@@ -105,19 +105,24 @@ def simulate(
     check_range("--trials", trials, 1, 10**6)
     check_range("--seed", seed, 0, 2**32 - 1)
     goes_wrong = None if life is None else life_file.read(life)
-    building = read_building(
-        world, path, drive=drive, resolution=resolution, unit=unit, layers=layers
-    )
-    walls, points = building.world, building.path
-    if building.notes:
-        (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
-        print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
-    for note in building.notes:
-        print(f"note: {note}", flush=True)
     config = Config(frontend=FrontendConfig(labels=labels))
     if landmarks == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
     simulated, config = _robot(robot, config)
+    building = read_building(
+        world,
+        path,
+        drive=drive,
+        resolution=resolution,
+        unit=unit,
+        layers=layers,
+        robot_radius=simulated.radius,
+    )
+    walls, points = building.world, building.path
+    (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
+    print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
+    for note in building.notes:
+        print(f"note: {note}", flush=True)
     given, match_scans = None, odometry == "scan"
     if goes_wrong is not None:
         with name_errors(str(life)):
@@ -135,7 +140,10 @@ def simulate(
     with folder(out) as out_dir:
         enable_caches()
         with name_errors("--robot"):
-            num_scans = drives.num_scans_of_drive(simulated, points)
+            num_scans = drives.num_scans_of_drive(simulated, points, building.world)
+        with name_errors(str(life)):
+            check_moved_at(given, simulated, num_scans)
+        print(f"{trials} trials of {num_scans} scans", flush=True)
         with stopwatch() as seconds:
             groups = trials_module.run_trials(
                 key,

@@ -9,7 +9,6 @@ from typing import Annotated, Any, TextIO
 import jax
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from jaxslam.cli.options import OutFolder, check_range
 from jaxslam.cli.study_variants import prepare
@@ -24,7 +23,8 @@ from jaxslam.study import processes as processes_module
 from jaxslam.study import reporting, runner, study_file
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.processes import Group, LostProcessError
-from jaxslam.study.runner import Progress, Variant
+from jaxslam.study.progress import run_shown
+from jaxslam.study.runner import Variant
 from jaxslam.study.wording import findings
 
 PARTS = "study_parts"  # folder of finished trials
@@ -110,7 +110,7 @@ def _run(
 ) -> list[Collected] | None:
     """All trials, with a progress bar; None where process 0 is not one of this machine."""
     if group is None:
-        return work(variants, num_trials, seed, parts)
+        return run_shown(variants, num_trials=num_trials, seed=seed, folder=parts)
     given = [runner.in_numpy(one) for one in variants], num_trials, seed, parts
     try:
         peaks = processes_module.run_group(group, _share, *given)
@@ -118,29 +118,10 @@ def _run(
         raise InputError(str(error)) from None
     if 0 not in group.own:
         return None
-    found = work(variants, num_trials, seed, parts)  # what the processes have kept
+    # What the processes have kept:
+    found = run_shown(variants, num_trials=num_trials, seed=seed, folder=parts)
     # The memory of all processes of this machine counts.
     return [one._replace(peak_mb=max(one.peak_mb, sum(peaks))) for one in found]
-
-
-def work(
-    variants: Sequence[Variant],
-    num_trials: int,
-    seed: int,
-    parts: Path,
-    stream: TextIO | None = None,
-) -> list[Collected]:
-    """Outcomes of all trials, with a progress bar."""
-    total = len(variants) * num_trials
-    with tqdm(total=total, unit="trial", desc="compiling", mininterval=0.5, file=stream) as bar:
-
-        def show(progress: Progress) -> None:
-            bar.set_description(variants[progress.variant].name[:30], refresh=False)
-            bar.update(progress.done_of_all - bar.n)
-
-        return runner.run_timed(
-            variants, num_trials=num_trials, seed=seed, folder=parts, callback=show
-        )
 
 
 def _share(
@@ -148,7 +129,7 @@ def _share(
 ) -> float:
     """Work of one of several processes: process 0 keeps the trials; its most memory [MB]."""
     enable_caches()
-    work(variants, num_trials, seed, parts, stream)
+    run_shown(variants, num_trials=num_trials, seed=seed, folder=parts, stream=stream)
     return peak_memory()
 
 

@@ -7,7 +7,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.cli.life_options import MATCHED, LivingWorld, leaving, leaving_note, life_of
+from jaxslam.cli.life_options import (
+    MATCHED,
+    LivingWorld,
+    check_moved_at,
+    leaving,
+    leaving_note,
+    life_of,
+)
 from jaxslam.cli.log_options import read_params
 from jaxslam.cli.options import name_errors
 from jaxslam.cli.world_options import Building, read_building
@@ -56,12 +63,14 @@ def prepare(study: StudyFile) -> Prepared:
     """
     notes: dict[str, None] = {}
     found: dict[str, Variant] = {}
+    alike: dict[str, str] = {}
     given = [with_life(one.settings, study.path.parent) for one in study.variants]
     _check_used(study.path, given)
     slots = 0
     for (name, *_), own in zip(study.variants, given, strict=True):
         with name_errors(f"{study.path}: {name}"):
-            place = _place(files_of(own, study.path.parent))
+            files = files_of(own, study.path.parent)
+            place = _place(files, _robot(files, {})[0])
             slots = max(slots, life_file.number_of_people(_life_in(own), _building(*place).path))
     # All of them draw the same random numbers then, and run the same program.
     lives = any(key in LIFE for own in given for key in own)
@@ -81,6 +90,12 @@ def prepare(study: StudyFile) -> Prepared:
         if mark in found:  # though their settings differ, as of a value that is the default
             raise same_variants(study.path, found[mark].name, name)
         found[mark] = variant
+        without = {f"life.{key}" for key in life_file.silent(_life_in(all_of_it))}
+        text = repr(sorted((k, x) for k, x in all_of_it.items() if k not in without))
+        other = alike.setdefault(text, name)
+        if other != name:
+            note = f"{other!r} and {name!r} have the same trials: what they differ in says nothing"
+            notes[note] = None
     return Prepared(tuple(found.values()), tuple(notes))
 
 
@@ -93,9 +108,9 @@ def _variant(
     notes: dict[str, None],
 ) -> Variant:
     """The variant with some settings; adds to the notes. Without slots nothing goes wrong."""
-    place = _place(given)
-    building = _building(*place)
     robot, config = _robot(given, notes)
+    place = _place(given, robot)
+    building = _building(*place)
     notes |= dict.fromkeys(building.notes)
     if given.get("landmarks") == "junctions":
         config = config._replace(filter=config.filter._replace(landmark_kinds=(JUNCTION,)))
@@ -112,6 +127,8 @@ def _variant(
     match_scans = given["odometry"] == "scan"
     lidar, path = config.frontend.lidar, np.asarray(building.path)
     driven = path.tobytes(), str(path.dtype)
+    num_scans = _num_scans(robot, np.asarray(building.world.walls, float).tobytes(), *driven)
+    check_moved_at(life, robot, num_scans)
     found = _leaving(lidar, np.asarray(world.walls, float).tobytes(), robot, *driven)
     if found.beyond_range:
         about = robot.scanner.name if robot.scanner else "the default scanner"
@@ -125,15 +142,16 @@ def _variant(
         robot,
         world,
         path,
-        _num_scans(robot, *driven),
+        num_scans,
         life,
         match_scans=match_scans,
     )
 
 
-def _place(given: Settings) -> tuple:
-    """What names a building and a drive in it."""
-    return tuple(given.get(key) for key in ("world", "path", "drive", "resolution", "unit"))
+def _place(given: Settings, robot: Robot) -> tuple:
+    """What names a building and a drive in it: settings, and the radius of the robot."""
+    names = ("world", "path", "drive", "resolution", "unit", "layers")
+    return *(given.get(key) for key in names), robot.radius
 
 
 def _life_in(given: Settings) -> dict[str, float]:
@@ -148,14 +166,19 @@ def _building(
     drive: str | None,
     resolution: float | None,
     unit: str | None,
+    layers: str | None,
+    robot_radius: float,
 ) -> Building:
     file = None if path is None else Path(path)
-    return read_building(world or "office", file, drive=drive, resolution=resolution, unit=unit)
+    options: dict[str, Any] = {"drive": drive, "resolution": resolution, "unit": unit}
+    options["layers"] = tuple(x.strip() for x in (layers or "").split(",") if x.strip())
+    return read_building(world or "office", file, **options, robot_radius=robot_radius)
 
 
 @lru_cache(maxsize=256)
-def _num_scans(robot: Robot, path: bytes, dtype: str) -> int:
-    return drives.num_scans_of_drive(robot, np.frombuffer(path, dtype).reshape(-1, 2))
+def _num_scans(robot: Robot, walls: bytes, path: bytes, dtype: str) -> int:
+    world = World(np.frombuffer(walls).reshape(-1, 4))
+    return drives.num_scans_of_drive(robot, np.frombuffer(path, dtype).reshape(-1, 2), world)
 
 
 @lru_cache(maxsize=64)
@@ -183,6 +206,8 @@ def _robot(given: Settings, notes: dict[str, None]) -> tuple[Robot, Config]:
         scanner = scanner_presets.preset(given["scanner"])
         robot = robot._replace(scanner=scanner, scan_period=1.0 / scanner.scan_rate)
         notes |= dict.fromkeys(f"{scanner.name}: {note}" for note in scanner.assumptions())
+    if robot.kinematics == "holonomic" and "encoder_noise" in given:
+        raise InputError("encoder_noise says nothing of a robot that is holonomic")
     robot = as_robot(robot._replace(**{k: given[k] for k in OF_ROBOT if k in given}))
     if robot.scanner is not None and robot.scan_period * robot.scanner.scan_rate < 1.0 - 1e-6:
         raise InputError(
@@ -200,8 +225,6 @@ def _params(given: Settings, robot: Robot, world: World, *, match_scans: bool) -
     default = kinematics.noise_params(robot, world, match_scans=match_scans)
     params = read_params(None if file is None else Path(file), default)
     q, r = (given.get(key, 1.0) for key in ("odometry_factor", "sensor_factor"))
-    if not (q > 0.0 and r > 0.0):
-        raise InputError("odometry_factor and sensor_factor are above 0")
     changed: dict[str, Any] = {"odometry_coefficients": params.odometry_coefficients * q}
     if params.odometry_cov_rate is not None:
         changed["odometry_cov_rate"] = params.odometry_cov_rate * q**2
@@ -213,8 +236,7 @@ def _params(given: Settings, robot: Robot, world: World, *, match_scans: bool) -
 
 def _check_used(path: Path, given: list[Settings]) -> None:
     """Raise InputError if a setting of what goes wrong says nothing in any variant."""
-    wrong = life_file.unused(map(_life_in, given))
+    wrong = life_file.unused(map(_life_in, given), "life.")
     if wrong is not None:
-        key, other = wrong
-        problem = f"says nothing without life.{other}"
-        raise InputError(problem, path=path, field=f"life.{key}", advice=f"add life.{other}")
+        key, problem, advice = wrong
+        raise InputError(problem, path=path, field=f"life.{key}", advice=advice)

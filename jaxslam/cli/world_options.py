@@ -13,6 +13,7 @@ from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.core.types import Array
 from jaxslam.io import path_file, world_files
+from jaxslam.io.drawing import size_of_unit
 from jaxslam.io.errors import InputError
 from jaxslam.io.world_files import WorldFile
 from jaxslam.simulation import named_worlds, path_checks, path_following, worlds
@@ -22,6 +23,7 @@ from jaxslam.simulation.worlds import World
 
 NEAR = 0.2  # [m] of a wall, where many robots do not fit
 NOT_PARALLEL = math.radians(0.05)  # standard deviation from which on it is said
+PART = 0.25  # of a building: a drive that sees no more may be inside of a column or a cabinet
 BEND = 0.01  # [m] by which waypoints are off the path that is driven
 
 
@@ -51,6 +53,7 @@ def read_building(
     resolution: float | None = None,
     unit: str | None = None,
     layers: tuple[str, ...] = (),
+    robot_radius: float = 0.0,
 ) -> Building:
     """The building of `--world` and the drive of `--path`.
 
@@ -62,10 +65,11 @@ def read_building(
         resolution: [m] of a pixel, of a picture.
         unit: Of a drawing.
         layers: Of a drawing that are read; empty for all.
+        robot_radius: [m] of the circle around the robot; 0: not known.
 
     Raises:
         InputError: There is no such world, a file or option is bad, there is no drive, or it leads
-            through walls or out of the building.
+            through walls or out of the building, or so near to walls that the robot does not fit.
     """
     if path is not None and drive is not None:
         raise InputError("is not for a drive that --path gives", field="--drive")
@@ -96,11 +100,16 @@ def read_building(
         )
     if path is not None:
         points = path_file.read(path) - building.origin
+        stated = unit is None and Path(world).suffix.lower() in (".svg", ".dxf")
+        if stated or (unit is not None and size_of_unit(unit) != 1.0):
+            notes.append(f"waypoints of {path} are in metres, whatever the unit of {world}")
         points = polylines.simplify(points, BEND)
-        notes += _check(path, points, building)
+        notes += _check(path, points, building, robot_radius)
     elif drive is not None:
         with name_errors("--drive"):
-            found = named_worlds.found_drive(building.world, drive, building.occupancy)
+            found = named_worlds.found_drive(
+                building.world, drive, building.occupancy, robot_radius=robot_radius
+            )
         walls = World(jnp.asarray(building.world.walls, float))
         notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
         driven = jnp.asarray(found.path, float)
@@ -108,12 +117,15 @@ def read_building(
     elif points is None:
         advice = "add --drive patrol, or --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
         raise InputError("is a file, which has no drive of its own", path=world, advice=advice)
+    elif robot_radius:
+        with name_errors(f"the drive of {world}"):
+            _check_room(points, building.world, robot_radius)
     walls = World(jnp.asarray(building.world.walls, float))
     driven = jnp.asarray(path_following.densify(points), float)
     return Building(walls, driven, tuple(notes), world, building.occupancy)
 
 
-def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
+def _check(file: Path, points: np.ndarray, building: WorldFile, robot_radius: float) -> list[str]:
     """Notes on a drive along waypoints (K, 2) [m, world frame]; InputError if there can be none."""
     x, y = building.origin
     about = f"{file}" if not building.origin.any() else f"{file} (less x {x:.0f}, y {y:.0f} m)"
@@ -124,11 +136,35 @@ def _check(file: Path, points: np.ndarray, building: WorldFile) -> list[str]:
             problem = f"starts at x {x:.2f}, y {y:.2f} m, where the map is {kind}"
             raise InputError(problem, path=about, advice="start in free space")
     with name_errors(about):
-        found = path_checks.check_path_in_world(points, building.world)
+        found = _check_room(points, building.world, robot_radius)
     notes = []
+    whole = np.ptp(np.reshape(building.world.walls, (-1, 2)), axis=0)
+    if found.seen.prod() < PART * whole.prod():
+        (width, height), (x, y) = found.seen, whole
+        notes.append(
+            f"around the path walls enclose {width:.1f} m x {height:.1f} m of {x:.1f} m x {y:.1f} m"
+        )
     if found.clearance < NEAR:
         notes.append(f"the path comes within {found.clearance:.2f} m of a wall")
+    if building.occupancy is not None:
+        even = path_following.densify(points)
+        unknown = [_kind_of_cell(building.occupancy, at) != "free" for at in even]
+        metres = np.mean(unknown) * polylines.length(points)
+        if metres >= 0.05:
+            notes.append(f"{metres:.1f} m of the path are where the map is unknown")
     return notes
+
+
+def _check_room(points: np.ndarray, world: World, robot_radius: float) -> path_checks.PathCheck:
+    """What was found along waypoints (K, 2) [m]; ValueError if a robot does not fit there."""
+    found = path_checks.check_path_in_world(points, world)
+    if found.clearance < robot_radius:
+        raise ValueError(
+            f"path comes within {found.clearance:.2f} m of a wall, from waypoint {found.leg + 1} "
+            f"to {found.leg + 2}, and the robot's [body] reaches {robot_radius:.2f} m from its "
+            "middle"
+        )
+    return found
 
 
 def _kind_of_cell(occupancy: OccupancyMap, point: np.ndarray) -> str:

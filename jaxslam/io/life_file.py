@@ -23,12 +23,14 @@ does not happen. `typical` instead of a file is what recorded drives show on ave
 `simulation`'s `RangeErrors`, `Traffic`, `WheelFaults` and `Moves` say what each is exactly.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from jaxslam.io import toml_or_json
+from jaxslam.io.errors import InputError
 from jaxslam.io.quantities import Table
 from jaxslam.simulation.life import AT_LEAST_ONE, POSITIVE, PROBABILITIES
 from jaxslam.simulation.life_defaults import people_on, typical_settings
@@ -98,6 +100,17 @@ NEEDS = {
 }
 """Keys that say nothing without another one."""
 
+SIZES = {"slip": "slip_share", "carpet": "carpet_turn", "carried": "carry", "moved": "moved_by"}
+"""Keys of what happens, and how much then; by default not 0."""
+
+MOST = {
+    **{"std_scale": 100.0, "std_per_range": 1.0, "std_by_incidence": 10.0, "shared_std": 1.0},
+    **{"shared_angle": 2 * math.pi, "resolution": 1.0, "spot": 0.5, "glass_angle": math.pi / 2},
+    **{"black_range": 1e3, "people": 1e4, "people_per_metre": 100.0, "speed": 20.0},
+    **{"missing": 0.99, "dropped": 0.99},  # else there is nothing to be mapped
+    **{"distance": 20.0, "moved_by": 20.0, "slip_share": 10.0, "carpet_turn": 10.0, "carry": 1e3},
+}
+"""Largest values in SI units; beyond them the unit is another one."""
 _MOST = 1e6
 
 
@@ -111,8 +124,8 @@ def read(path: str | PathLike) -> dict[str, float]:
         Numbers in SI units by their keys, as they are in the file.
 
     Raises:
-        InputError: The file cannot be read, or is neither; a key is unknown, or says nothing
-            without another one; a value is not possible, or has an unknown unit.
+        InputError: The file cannot be read, is neither, or asks for nothing; a key is unknown, or
+            says nothing without another one; a value is not possible, or has an unknown unit.
     """
     if str(path) == TYPICAL:
         return typical_settings()
@@ -121,9 +134,13 @@ def read(path: str | PathLike) -> dict[str, float]:
     table = Table(path, "life", content)
     table.check_keys(tuple(SETTINGS))
     found = {key: number(table, key, given) for key, given in content.items()}
-    missing = unused([found])
-    if missing is not None:
-        raise table.error(missing[0], f"says nothing without {missing[1]}", f"add {missing[1]}")
+    if not found:
+        raise InputError("asks for nothing", path=path, advice=advice)
+    if "people" in found and "people_per_metre" in found:
+        raise table.error("people_per_metre", "says nothing beside people", "leave one of both out")
+    wrong = unused([found])
+    if wrong is not None:
+        raise table.error(*wrong)
     return found
 
 
@@ -139,28 +156,52 @@ def number(table: Table, key: str, given: Any) -> float:
         InputError: It is no such quantity, or not possible.
     """
     part = SETTINGS[key]
-    low, high = 0.0, 1.0 if key in (*PROBABILITIES.get(part, ()), "moved") else _MOST
+    is_share = key in (*PROBABILITIES.get(part, ()), "moved")
+    low, high = 0.0, MOST.get(key, 1.0 if is_share else _MOST)
     if key in POSITIVE.get(part, ()):
         low = 1e-6
     elif key in AT_LEAST_ONE.get(part, ()):
         low = 1.0
     elif key == "std_by_incidence":
-        low = -_MOST
+        low = -high
     found = table.checked(key, given, KINDS.get(key, "ratio"), low, high)
     if found is None or (key in WHOLE and found != int(found)):
         raise table.error(key, f"{given!r} is no whole number")
     return int(found) if key in WHOLE else found
 
 
-def unused(all_settings: Iterable[Mapping[str, float]]) -> tuple[str, str] | None:
-    """A key that says nothing in any of these settings, and the one that it needs; None if none."""
+def unused(
+    all_settings: Iterable[Mapping[str, float]], prefix: str = ""
+) -> tuple[str, str, str] | None:
+    """A key that says nothing in any of these settings; None if there is none.
+
+    Returns:
+        The key, what is wrong with it, and what to do; names of other keys have the prefix.
+    """
     everywhere = list(all_settings)
     for key, other in NEEDS.items():
         given = [own for own in everywhere if key in own]
-        others = (other, "people_per_metre") if other == "people" else (other,)
-        if given and not any(own.get(name) for own in given for name in others):
-            return key, other
+        if given and all(key in silent(own) for own in given):
+            name = f"{prefix}{other}"
+            if any(other in own for own in given):
+                return key, f"says nothing where {name} is 0", f"give {name} above 0"
+            return key, f"says nothing without {name}", f"add {name}"
+    for key, size in SIZES.items():
+        given = [own for own in everywhere if own.get(key)]
+        if given and not any(own.get(size, 1.0) for own in given):
+            name = f"{prefix}{size}"
+            return key, f"says nothing where {name} is 0", f"give {name} above 0"
     return None
+
+
+def silent(settings: Mapping[str, float]) -> set[str]:
+    """Keys that say nothing beside the other ones, as `speed` where `people` is 0."""
+    found = set()
+    for key, other in NEEDS.items():
+        others = (other, "people_per_metre") if other == "people" else (other,)
+        if key in settings and not any(settings.get(name) for name in others):
+            found.add(key)
+    return found
 
 
 def number_of_people(settings: Mapping[str, float], path: Any) -> int:
@@ -180,4 +221,5 @@ def parts(settings: Mapping[str, float]) -> dict[str, Any]:
 
 def describe(settings: Mapping[str, float]) -> str:
     """What goes wrong, in a line."""
-    return ", ".join(f"{key} {value:g}" for key, value in settings.items())
+    hidden = "people_per_metre" if "people" in settings else None
+    return ", ".join(f"{key} {value:g}" for key, value in settings.items() if key != hidden)

@@ -68,5 +68,5 @@ def _geojson(path: Path) -> np.ndarray:
     ]
     if len(found) != 1:
         raise InputError(f"has {len(found)} LineStrings, not one", path=path, advice=ADVICE)
-    size, _ = unit_of(path, content, found[0], None)
+    size, _ = unit_of(path, content, found[0], None, has_option=False)
     return size * found[0]

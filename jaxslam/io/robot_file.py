@@ -29,7 +29,8 @@ alone in the SI unit. `*` marks what must be there. An unknown key is an error. 
     [mount_error]     x, y, yaw of the true scanner in the frame of the known one
     [timing]          scan_latency, odometry_latency: from a measurement to its stamp;
                       time_offset: by which the clock of the odometry is ahead
-    [body]            radius of a circle around the origin, or length and width around it
+    [body]            radius of a circle around the origin, or length and width around it: drives
+                      keep the circle from walls, and a path that does not is refused
 """
 
 import math

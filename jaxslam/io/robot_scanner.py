@@ -49,6 +49,10 @@ def read_scanner(table: Table) -> Scanner:
             own[key] = _pieces(table, key)
     if base is None and not any(key in own for key in ERRORS):
         raise table.error("range_noise", "is missing", ERROR_FORM)
+    if "range_noise" in own:
+        for key in ERRORS[1:]:
+            if key in own:
+                raise table.error(key, "says nothing beside range_noise", "leave one of both out")
     own |= _geometry(table, base)
     scanner_name = table.text("name")
     if base is None:
@@ -57,16 +61,32 @@ def read_scanner(table: Table) -> Scanner:
         if any(key in own for key in ERRORS):  # those of the file alone count
             own = dict.fromkeys(ERRORS) | {"error_notes": ()} | own
         if own:
-            base = base._replace(notes=tuple(f"preset {base.name}: {x}" for x in base.notes))
+            notes = *base.notes, *_beyond_source(own, base)
+            base = base._replace(notes=tuple(f"preset {base.name}: {x}" for x in notes))
         scanner = base._replace(**own, name=scanner_name or base.name)
     if not scanner.range_min < scanner.range_max:
         problem = f"{scanner.range_min:g} m is not below range_max, {scanner.range_max:g} m"
         raise table.error("range_min", problem, "give both")
+    for key in ERRORS:
+        start = max((piece.from_range for piece in own.get(key) or ()), default=0.0)
+        if start >= scanner.range_max:
+            problem = f"a piece from {start:g} m says nothing: range_max is {scanner.range_max:g} m"
+            raise table.error(key, problem, "check its unit")
     try:
         check_scanner(scanner)
     except ValueError as error:
         raise table.error("", str(error)) from None
     return scanner
+
+
+def _beyond_source(own: dict[str, Any], base: Scanner) -> list[str]:
+    """Notes on values of a section that are better than those of the source of its preset."""
+    better = {"scan_rate": ("Hz", 1), "range_max": ("m", 1), "range_min": ("m", -1)}
+    return [
+        f"{key} is {own[key]:g} {unit}, and {getattr(base, key):g} {unit} by its source"
+        for key, (unit, sign) in better.items()
+        if key in own and sign * (own[key] - getattr(base, key)) > 0.0
+    ]
 
 
 def _geometry(table: Table, base: Scanner | None) -> dict[str, Any]:

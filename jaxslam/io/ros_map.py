@@ -57,6 +57,9 @@ def read(path: str | PathLike) -> OccupancyMap:
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError("is not a list of three numbers", path=path, field="origin")
     origin = np.array([_number(path, "origin", value) for value in origin])
+    if abs(origin[2]) > 2.0 * np.pi:
+        problem = f"{origin[2]:g} is no yaw in radians"
+        raise InputError(problem, path=path, field="origin", advice="90 degrees are 1.5708")
     negate = fields["negate"]
     if not isinstance(negate, int) or negate not in (0, 1):
         raise InputError(f"{_excerpt(negate)} is neither 0 nor 1", path=path, field="negate")

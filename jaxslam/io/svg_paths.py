@@ -20,7 +20,8 @@ def polylines_of(shape: Any, tolerance: float) -> Iterator[np.ndarray]:
     import svgelements
 
     points: list[tuple[float, float]] = []
-    for part in svgelements.Path(shape):
+    # A shape that is turned or skewed keeps its transform apart from its numbers.
+    for part in svgelements.Path(shape).segments(transformed=True):
         if isinstance(part, svgelements.Move):
             if len(points) > 1:
                 yield np.array(points)

@@ -11,8 +11,13 @@ SVG = "{http://www.w3.org/2000/svg}"
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 LENGTH = re.compile(rf"\s*({NUMBER})\s*(px|mm|cm|in|pt|pc|em|ex|%|)\s*$", re.IGNORECASE)
 LENGTHS = "x y x1 y1 x2 y2 cx cy r rx ry width height".split()
-FUNCTION = r"(?:matrix|translate|scale|rotate|skew)[XYxy]?\s*\([-+.,\s\da-zA-Z%]*\)"
-TRANSFORM = re.compile(rf"\s*(?:none|(?:{FUNCTION}[\s,]*)*)$")
+FUNCTION = re.compile(r"([a-z]+)\s*\(([^()]*)\)", re.IGNORECASE)
+ARGUMENTS = {"matrix": (6,), "translate": (1, 2), "scale": (1, 2), "rotate": (1, 3), "skew": (1, 2)}
+ARGUMENTS |= {name + axis: (1,) for name in ("translate", "scale", "skew") for axis in "xy"}
+"""How many numbers a transform of a name may have."""
+UNITS = {"translate": "px", "rotate": "deg|rad|grad|turn", "skew": "deg|rad|grad|turn"}
+"""Units of these that svgelements applies; with others it drops the shape."""
+STYLED = re.compile(r"(?<![-\w])transform(-origin)?\s*:\s*([^;}]*)", re.IGNORECASE)
 SHAPES = set("svg use line polyline polygon rect circle ellipse".split())
 NOT_DRAWN = {f"{SVG}{tag}" for tag in ("symbol", "marker", "mask", "clipPath", "pattern")}
 MAX_BYTES = 2**26
@@ -28,7 +33,7 @@ def read(path: Path) -> ET.Element:
     Raises:
         InputError: The file cannot be read, is no SVG, or has a number, a list of points or a
             transform that is malformed, of which svgelements would read a part; or it uses a symbol
-            that has a `viewBox`, which svgelements does not apply.
+            that has a `viewBox`, or the origin of a transform, which svgelements does not apply.
     """
     try:
         with open(path, "rb") as file:
@@ -76,12 +81,39 @@ def _check_attributes(path: Path, tree: ET.Element) -> None:
             and not _is_length(value)
             or name == "points"
             and not _is_list_of_points(value)
-            or name == "transform"
-            and not TRANSFORM.match(value)
         ]
         for name in wrong:
             problem = f"{item.get(name)!r:.60} is malformed"
             raise InputError(problem, path=path, field=f"<{tag}> {name}", advice="correct it")
+        _check_transforms(path, item, tag)
+
+
+def _check_transforms(path: Path, item: ET.Element, tag: str) -> None:
+    """Raise InputError if a transform of an element is malformed, or has an origin of its own."""
+    style = item.text or "" if tag == "style" else item.get("style", "")
+    given = [("-origin" if origin else "", value) for origin, value in STYLED.findall(style)]
+    given += [(k, item.get(f"transform{k}", "")) for k in ("", "-origin")]
+    for kind, value in given:
+        field = f"<{tag}> transform{kind}"
+        if kind and value.strip(" 0px,"):  # not 0 0, which is the default
+            problem = f"{value!r:.60} is not applied"
+            advice = "write rotate(angle x y), or apply the transform to the shapes"
+            raise InputError(problem, path=path, field=field, advice=advice)
+        if not kind and not _is_transform(value):
+            problem = f"{value!r:.60} is malformed"
+            raise InputError(problem, path=path, field=field, advice="write numbers without units")
+
+
+def _is_transform(value: str) -> bool:
+    """Whether a text is a list of transforms whose numbers are all understood."""
+    if value.strip() == "none":
+        return True
+    for name, arguments in FUNCTION.findall(value):
+        units = next((own for key, own in UNITS.items() if name.lower().startswith(key)), "")
+        rest, count = re.subn(rf"{NUMBER}(?:{units})?", " ", arguments)
+        if count not in ARGUMENTS.get(name.lower(), ()) or rest.replace(",", " ").strip():
+            return False
+    return not FUNCTION.sub(" ", value).replace(",", " ").strip()
 
 
 def _is_length(value: str) -> bool:

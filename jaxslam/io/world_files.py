@@ -22,6 +22,7 @@ SUFFIXES = (*MAPS, *pictures.SUFFIXES, *GEOJSON, *TABLES, ".svg", ".dxf")
 
 MIN_WALL = 1e-4  # [m] shorter ones have no length
 MIN_SIZE, MAX_SIZE = 1.0, 1e4  # [m] width or height of a building
+MAX_ASSUMED = 2000.0  # [m] the same, of a drawing whose unit the user has not given
 FAR = 2000.0  # [m] coordinates beyond it are moved, as single precision has a millimetre at 8 km
 MAX_WALLS = 10**6
 KINDS = (
@@ -74,7 +75,8 @@ def read_world(
 
     Raises:
         InputError: The file cannot be read; it needs an argument or has no use for one; or it holds
-            no walls, too many, or a building smaller than `MIN_SIZE` or larger than `MAX_SIZE`.
+            no walls, too many, or a building smaller than `MIN_SIZE` or larger than `MAX_SIZE`, or
+            than `MAX_ASSUMED` by a unit that is not given.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -105,7 +107,7 @@ def read_world(
     notes = [*drawing.notes]
     if left_out:
         notes.append("left out: " + ", ".join(f"{what} ({n})" for what, n in left_out.items()))
-    _check_size(path, walls, notes)
+    _check_size(path, walls, notes, MAX_ASSUMED if unit is occupancy is None else MAX_SIZE)
     origin = np.zeros(2)
     if np.abs(walls).max() > FAR:
         origin = np.floor(walls.reshape(-1, 2).min(axis=0))
@@ -159,8 +161,11 @@ def _distinct(walls: np.ndarray) -> tuple[np.ndarray, Counter[str]]:
     return kept[np.sort(first)], +left_out
 
 
-def _check_size(path: Path, walls: np.ndarray, notes: Sequence[str]) -> None:
-    """Raise InputError if there are no walls, too many, or the size is not of a building."""
+def _check_size(path: Path, walls: np.ndarray, notes: Sequence[str], most: float) -> None:
+    """Raise InputError if there are no walls, too many, or they are smaller or larger than `most`.
+
+    The largest size is in metres; so are the walls.
+    """
     if not len(walls):
         reason = notes[-1] if notes and notes[-1].startswith("left out") else None
         raise InputError("holds no wall", path=path, advice=reason)
@@ -168,7 +173,7 @@ def _check_size(path: Path, walls: np.ndarray, notes: Sequence[str]) -> None:
         problem = f"holds {len(walls)} walls, more than {MAX_WALLS}"
         raise InputError(problem, path=path, advice="cut it into parts, or pick --layers")
     size = np.ptp(walls.reshape(-1, 2), axis=0)
-    if not MIN_SIZE <= size.max() <= MAX_SIZE:
+    if not MIN_SIZE <= size.max() <= most:
         problem = f"is {size[0]:.3g} m x {size[1]:.3g} m, not the size of a building"
         advice = "give the side of a pixel by --resolution, or the unit of a drawing by --unit, in "
         advice += "metres: --unit 0.1 for a drawing of 1:100 in mm"

@@ -77,6 +77,9 @@ def geometries(path: Path, content: Any) -> Iterator[tuple[str, str, dict | None
         if not isinstance(item, dict) or not isinstance(item.get("type"), str):
             problem = "is no object of GeoJSON, with a type"
             raise InputError(problem, path=path, field=field, advice=GEOJSON_ADVICE)
+        if where and item.get("crs") is not None:
+            problem, advice = "has a crs of its own", "give one, at the top of the file"
+            raise InputError(problem, path=path, field=field, advice=advice)
         lists = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
         if item["type"] in lists:
             name = lists[item["type"]]
@@ -120,9 +123,25 @@ def lines_of(path: Path, where: str, coordinates: Any, depth: int) -> Iterator[n
 
 
 def unit_of(
-    path: Path, content: Any, points: np.ndarray, unit: str | float | None
+    path: Path,
+    content: Any,
+    points: np.ndarray,
+    unit: str | float | None,
+    *,
+    has_option: bool = True,
 ) -> tuple[float, str]:
-    """Length [m] of a unit of the coordinates (n, 2), and a note on it."""
+    """Length [m] of a unit of the coordinates (n, 2), and a note on it.
+
+    Args:
+        path: GeoJSON file.
+        content: Of it.
+        points: Its coordinates.
+        unit: Of them, as it is given; None: not given.
+        has_option: Whether the file is one for which a user can give it.
+
+    Raises:
+        InputError: They are or may be degrees, or their unit is not known.
+    """
     advice = "project it to metres first, as by geopandas: data.to_crs(data.estimate_utm_crs())"
     crs = content.get("crs")
     name = str(crs.get("properties", {}).get("name", crs) if isinstance(crs, dict) else crs)[:80]
@@ -136,10 +155,15 @@ def unit_of(
     if unit is not None:
         return size_of_unit(unit), ""
     if crs is not None and not UTM.search(name):
-        raise unit_missing(path, f"the unit of its coordinate reference system {name} is not known")
+        problem = f"the unit of its coordinate reference system {name} is not known"
+        if not has_option:
+            advice = f"leave crs out if it has metres, or {advice}"
+            raise InputError(problem, path=path, field="crs", advice=advice)
+        raise unit_missing(path, problem)
     if crs is None and len(points) and np.ptp(points, axis=0).max() < MIN_SPAN:
         problem = f"spans less than {MIN_SPAN:g} and may have degrees of longitude and latitude"
-        raise InputError(problem, path=path, advice=f"{advice}; or add --unit m if it has metres")
+        advice += "; or add --unit m if it has metres" if has_option else ", or write CSV of metres"
+        raise InputError(problem, path=path, advice=advice)
     return 1.0, "" if crs is not None else "coordinates are taken as metres"
 
 
@@ -180,7 +204,8 @@ def read_csv(path: Path, unit: str | float | None = None) -> Drawing:
     table = size * np.array(values)
     walls = table[:, [names.index(name) for name in ENDS]]
     other = [name for name in names if name not in (*ENDS, THICKNESS)]
-    note = f"columns not read: {', '.join(other)}" if other else ""
+    notes = [f"columns not read: {', '.join(other)}"] if other else []
+    notes += ["numbers are taken as metres"] if unit is None else []
     if THICKNESS in names:
         thickness = table[:, names.index(THICKNESS)]
         if (thickness < 0.0).any():
@@ -190,7 +215,7 @@ def read_csv(path: Path, unit: str | float | None = None) -> Drawing:
                 problem, path=path, line=first, field=THICKNESS, advice="give 0 or more"
             )
         walls = _faces(walls, thickness)
-    return Drawing(walls, {}, (note,) if note else ())
+    return Drawing(walls, {}, tuple(notes))
 
 
 def split_fields(line: bytes) -> list[bytes]:

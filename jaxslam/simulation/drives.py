@@ -10,18 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.core.batching import map_batches
-from jaxslam.core.episode import Episode
-from jaxslam.core.features import Features
+from jaxslam.core import se2_np
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import compose
 from jaxslam.core.types import Array, Key
-from jaxslam.frontend import extract
-from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.lidar import to_scan
-from jaxslam.matching import scan_matching
-from jaxslam.matching.icp import ScanMatchSpec
-from jaxslam.simulation import arguments, kinematics, ray_casting, scanners, wheel_faults
+from jaxslam.simulation import (
+    arguments,
+    kinematics,
+    path_checks,
+    ray_casting,
+    scanners,
+    wheel_faults,
+)
 from jaxslam.simulation.drive_draws import SUBSTEPS, Draws, draw_drive
 from jaxslam.simulation.life import Events, Life, scan_life
 from jaxslam.simulation.robot import Robot
@@ -122,17 +123,24 @@ def drive_as_drawn(
     return poses, kinematics.report_odometry(robot, jnp.pad(odometry, ((1, 0), (0, 0))))
 
 
-def num_scans_of_drive(robot: Robot, path: Any) -> int:
+def num_scans_of_drive(robot: Robot, path: Any, world: World | None = None) -> int:
     """Number of scans on a noise-free drive to the end of a path (N, 2).
+
+    Args:
+        robot: The robot.
+        path: Its path.
+        world: Walls that neither robot nor scanner may go through; None for none.
 
     Raises:
         ValueError: The robot or the path is not possible, the robot does not arrive, or it cannot
-            turn on the spot and leaves the path.
+            turn on the spot and leaves the path; or it goes through a wall.
     """
     points = arguments.as_path(path, None)
     # Neither where the scanner is nor its clock changes how the robot drives.
     still = (0.0, 0.0, 0.0)
-    robot = arguments.as_robot(robot)._replace(mount=still, nominal_mount=still, time_offset=0.0)
+    robot = arguments.as_robot(robot)
+    mount = se2_np.compose(np.array(robot.nominal_mount), np.array(robot.mount))
+    robot = robot._replace(mount=still, nominal_mount=still, time_offset=0.0)
     robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=still)
     robot = robot._replace(odometry_rate=0.0)
     upper_bound = 40 + int(4 * _least_motions(robot, np.asarray(points)))
@@ -145,15 +153,21 @@ def num_scans_of_drive(robot: Robot, path: Any) -> int:
             f"wheel_scales are {robot.wheel_scales}, its wheel_base_scale {robot.wheel_base_scale}"
         )
     radius = kinematics.turning_radius(robot)
+    driven = np.asarray(poses, float)[: 1 + int(moving.sum())]
     if radius:
-        driven = np.asarray(poses)[: 1 + int(moving.sum()), :2]
-        departure = max(np.hypot(*(np.asarray(points) - at[None]).T).min() for at in driven)
+        departure = max(np.hypot(*(np.asarray(points) - at[None, :2]).T).min() for at in driven)
         if departure > MAX_DEPARTURE:
             raise ValueError(
                 f"robot leaves the path by {departure:.2f} m, at most {MAX_DEPARTURE} m are "
                 f"driven: its turning radius is {radius:.2f} m; give a path with wider bends"
             )
-    return 1 + int(moving.sum())
+    if world is not None:
+        about = "following the path, the"
+        path_checks.check_line_in_world(driven[:, :2], world, f"{about} robot")
+        if mount[:2].any():
+            scanner = se2_np.compose(driven, mount)[:, :2]
+            path_checks.check_line_in_world(scanner, world, f"{about} scanner, at its mount,")
+    return len(driven)
 
 
 def _least_motions(robot: Robot, path: np.ndarray) -> float:
@@ -163,61 +177,6 @@ def _least_motions(robot: Robot, path: np.ndarray) -> float:
     turns = np.diff(np.unwrap(np.arctan2(legs[:, 1], legs[:, 0])))
     steps = np.sum(np.linalg.norm(along, axis=1)) / (robot.max_speed * robot.scan_period)
     return max(steps, np.abs(turns).sum() / (robot.max_turn_rate * robot.scan_period))
-
-
-def simulate_episode(
-    key: Key,
-    config: FrontendConfig,
-    robot: Robot,
-    world: World,
-    path: Array,
-    *,
-    num_scans: int,
-    noise_by_incidence: float = 0.0,
-    life: Life | None = None,
-    matching: ScanMatchSpec | None = None,
-) -> Episode:
-    """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
-
-    Scans are matched, too, if `matching` says by which options. The standard deviation of a range
-    has the factor exp(`noise_by_incidence` times the angle [rad] between its beam and the normal of
-    the wall). It is that of `robot.scanner`, if there is one.
-    """
-    scan_of, items, odometry = _drive(
-        key,
-        config.lidar,
-        robot,
-        world,
-        path,
-        num_scans=num_scans,
-        noise_by_incidence=noise_by_incidence,
-        life=life,
-    )
-
-    return episode_of(config, scan_of, items, odometry, matching=matching)
-
-
-def episode_of(
-    config: FrontendConfig,
-    scan_of: Callable[[tuple], Scan],
-    items: tuple,
-    odometry: Array,
-    *,
-    matching: ScanMatchSpec | None = None,
-) -> Episode:
-    """The episode of a drive whose scans are still to be made, by `drive_and_scan`."""
-    matches = None
-    if matching is not None:
-        # Scan matching takes them in turn, the front end some at a time: they are made before.
-        items = items[0], lax.map(scan_of, items)
-        empty = scan_matching.empty_submap(matching, config.lidar)
-        matches = scan_matching.match_scans(matching, config.lidar, empty, items[1], odometry)[1]
-
-    def features(item: tuple) -> Features:
-        return extract.extract_features(config, item[1] if matching else scan_of(item))
-
-    extracted = map_batches(features, items, batch_size=extract.SCAN_BATCH)
-    return Episode(truth=items[0], odometry=odometry, features=extracted, scan_matches=matches)
 
 
 def simulate_scans(
@@ -231,13 +190,13 @@ def simulate_scans(
     life: Life | None = None,
 ) -> tuple[Array, Array, Scan]:
     """True poses (T, 3), odometry increments (T, 3) and scans [T] of `simulate_episode`."""
-    scan_of, items, odometry = _drive(
+    scan_of, items, odometry = drive_by_key(
         key, lidar, robot, world, path, num_scans=num_scans, life=life
     )
     return items[0], odometry, lax.map(scan_of, items)
 
 
-def _drive(
+def drive_by_key(
     key: Key,
     lidar: Lidar,
     robot: Robot,

@@ -44,9 +44,7 @@ def typical_life(
     people_per_metre: float = PEOPLE_PER_METRE,
     ranges: RangeErrors = RANGES,
     wheels: WheelFaults = WHEELS,
-    max_people: int | None = None,
-    doors: Any = None,
-    furniture: tuple[Any, Any] | None = None,
+    **others: Any,
 ) -> Life:
     """Life in a world as it is on a usual drive.
 
@@ -56,16 +54,13 @@ def typical_life(
         people_per_metre: [1 / m] of `walkway_length`.
         ranges: Errors of ranges.
         wheels: Faults of wheels, odometry and scans.
-        max_people: As of `life_in`; so are the others.
-        doors: (D, 4) [m].
-        furniture: (P, 4) [m], before and after.
+        others: As of `life_in`, but for `traffic`.
 
     Raises:
         ValueError: An argument is not possible.
     """
     traffic = Traffic(people=float(people_on(path, people_per_metre)), carts=CARTS)
-    own = {"max_people": max_people, "doors": doors, "furniture": furniture}
-    return life_in(world, path, ranges=ranges, traffic=traffic, wheels=wheels, **own)
+    return life_in(world, path, ranges=ranges, traffic=traffic, wheels=wheels, **others)
 
 
 def walkway_length(path: Any) -> int:

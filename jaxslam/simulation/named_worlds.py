@@ -49,11 +49,24 @@ def _patrol_of(name: str) -> np.ndarray:
     return path
 
 
-def found_drive(world: World, kind: str, occupancy: OccupancyMap | None = None) -> FoundDrive:
+def found_drive(
+    world: World,
+    kind: str,
+    occupancy: OccupancyMap | None = None,
+    *,
+    robot_radius: float = 0.0,
+) -> FoundDrive:
     """A drive of one of the `DRIVES` in a world, and in the map that it was made of, if there is.
+
+    Args:
+        world: The walls.
+        kind: Of the drive.
+        occupancy: The map that the walls were made of, if there is one.
+        robot_radius: [m] that it keeps from all walls; 0: not known, as `patrols` assume it.
 
     Raises:
         ValueError: There is no such kind, or no such drive.
     """
     find = worlds.lookup(DRIVES, kind, "kind of drive")
-    return find(np.asarray(world.walls, float), occupancy=occupancy)
+    size = {"robot_radius": robot_radius} if robot_radius else {}
+    return find(np.asarray(world.walls, float), occupancy=occupancy, **size)

@@ -1,20 +1,27 @@
 """Simulated drives of one robot in one world, as episodes: one for each trial of an experiment."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
+from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
+from jaxslam.core.features import Features
+from jaxslam.core.scan import Scan
 from jaxslam.core.types import Array, Key, as_count, as_size, check_type
+from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
+from jaxslam.matching import scan_matching
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.pipeline.arguments import check_config
 from jaxslam.pipeline.config import Config
-from jaxslam.simulation import arguments
-from jaxslam.simulation.drives import num_scans_of_drive, simulate_episode
+from jaxslam.simulation import arguments, drives, path_checks
+from jaxslam.simulation.drives import num_scans_of_drive
 from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
@@ -63,6 +70,7 @@ def drive_of(
     walls = arguments.as_world(world, config.frontend.lidar.range_max)
     arguments.check_lidar_of(robot, config.frontend.lidar)
     points = arguments.as_path(path, world)
+    path_checks.check_line_in_world(np.asarray(points), walls, "path")
     if life is not None:
         check_type("life", life, Life, advice=": see jaxslam.simulation.life_in")
         if len(life.materials) != len(walls.walls):
@@ -73,7 +81,7 @@ def drive_of(
     check_type("match_scans", match_scans, bool)
     matching = config.scan_matching if match_scans else None
     if num_scans is None:
-        steps = num_scans_of_drive(robot, points)
+        steps = num_scans_of_drive(robot, points, walls)
     else:
         steps = as_count("num_scans", num_scans)
     return TrialDrive(robot, walls, points, steps, life, matching)
@@ -129,6 +137,61 @@ def simulate_drives(
         matching=matching,
     )
     return lax.map(lambda key: one(key, config, robot, world, path), keys)
+
+
+def simulate_episode(
+    key: Key,
+    config: FrontendConfig,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+    matching: ScanMatchSpec | None = None,
+) -> Episode:
+    """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
+
+    Scans are matched, too, if `matching` says by which options. The standard deviation of a range
+    has the factor exp(`noise_by_incidence` times the angle [rad] between its beam and the normal of
+    the wall). It is that of `robot.scanner`, if there is one.
+    """
+    scan_of, items, odometry = drives.drive_by_key(
+        key,
+        config.lidar,
+        robot,
+        world,
+        path,
+        num_scans=num_scans,
+        noise_by_incidence=noise_by_incidence,
+        life=life,
+    )
+
+    return episode_of(config, scan_of, items, odometry, matching=matching)
+
+
+def episode_of(
+    config: FrontendConfig,
+    scan_of: Callable[[tuple], Scan],
+    items: tuple,
+    odometry: Array,
+    *,
+    matching: ScanMatchSpec | None = None,
+) -> Episode:
+    """The episode of a drive whose scans are still to be made, by `drive_and_scan`."""
+    matches = None
+    if matching is not None:
+        # Scan matching takes them in turn, the front end some at a time: they are made before.
+        items = items[0], lax.map(scan_of, items)
+        empty = scan_matching.empty_submap(matching, config.lidar)
+        matches = scan_matching.match_scans(matching, config.lidar, empty, items[1], odometry)[1]
+
+    def features(item: tuple) -> Features:
+        return extract.extract_features(config, item[1] if matching else scan_of(item))
+
+    extracted = map_batches(features, items, batch_size=extract.SCAN_BATCH)
+    return Episode(truth=items[0], odometry=odometry, features=extracted, scan_matches=matches)
 
 
 def trial_keys(key: Key, trials: Array) -> Key:

@@ -21,6 +21,7 @@ from jaxslam.simulation import drives, kinematics, wheel_faults
 from jaxslam.simulation.drive_draws import LIFE, SUBSTEPS, Draws, LifeDraws
 from jaxslam.simulation.life import Life, draw_events
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.trial_episodes import episode_of
 from jaxslam.simulation.worlds import World
 
 
@@ -106,7 +107,7 @@ def simulate_from_noise(
         draws_of(noise, life), *given, life=life, mount_error=mount_error
     )
 
-    return drives.episode_of(config, scan_of, items, odometry, matching=matching)
+    return episode_of(config, scan_of, items, odometry, matching=matching)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))

@@ -71,10 +71,12 @@ def _tables(path: Path, given: dict[str, Any]) -> dict[str, dict[Any, float]]:
             raise unknown(path, name, ("base", *SETTINGS), "cost")
         if not isinstance(table, dict):
             raise InputError("is no table of costs by value", path=path, field=f"cost.{name}")
-        found[name] = {
-            _value(path, name, key): number(path, f"cost.{name}.{key}", cost, 0.0, math.inf)
-            for key, cost in table.items()
-        }
+        found[name] = {}
+        for key, cost in table.items():
+            field, value = f"cost.{name}.{key}", _value(path, name, key)
+            if value in found[name]:
+                raise InputError(f"is another cost of {value!r}", path=path, field=field)
+            found[name][value] = number(path, field, cost, 0.0, math.inf)
     return found
 
 

@@ -13,6 +13,7 @@ from jax.experimental import multihost_utils
 from jaxslam.core.memory import peak_memory, release_memory
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import replace
+from jaxslam.pipeline.episodes import EPISODE_BATCH
 
 TRIALS_PER_FILE = 64
 
@@ -55,7 +56,8 @@ def collect(
         num_trials: N.
         folder: For finished trials; None to keep nothing.
         mark: Text that is another one for trials of something else.
-        warm_up: Whether the first trial is computed twice, so that compiling is not timed.
+        warm_up: Whether the first round of trials, of all devices, is computed twice, so that
+            compiling is not timed, nor that of what is done with as many results.
         callback: Called with the number of trials that are done.
 
     Raises:
@@ -70,7 +72,7 @@ def collect(
     if callback is not None:
         callback(min(first, num_trials))
     if warm_up and first < num_trials:
-        next(results(first + 1, first))
+        next(results(min(first + EPISODE_BATCH * jax.device_count(), num_trials), first))
         release_memory()
     begin = perf_counter()
     new: list[Record] = []

@@ -15,6 +15,7 @@ TEXTS = {
     "path": "file of waypoints",
     "drive": "patrol or route",
     "unit": "unit of a drawing",
+    "layers": "names of the layers of a drawing whose lines are walls, parted by commas",
     "robot": "file of the robot",
     "scanner": "name of a scanner",
     "noise": "file of the noise parameters of the filter",
@@ -23,17 +24,17 @@ TEXTS = {
     "landmarks": "all or junctions",
     "labels": "segments or codes",
 }
-NUMBERS = {  # kind of `quantities`, least, and what it is
-    "resolution": ("length", 0.0, "of a pixel"),
-    "max_speed": ("speed", 0.0, "of the robot"),
-    "max_turn_rate": ("turn rate", 0.0, "of the robot"),
-    "encoder_noise": ("length over a metre", 0.0, "of the robot"),
-    "scan_period": ("time", 0.0, "of the robot"),
-    "time_offset": ("time", -1e3, "of the robot"),
-    "wheel_base_scale": ("ratio", 0.0, "of the robot"),
-    "odometry_factor": ("ratio", 0.0, "on the standard deviations of Q"),
-    "sensor_factor": ("ratio", 0.0, "on the standard deviations of R"),
-    "max_landmarks": ("number", 1.0, "capacity of the filter"),
+NUMBERS = {  # kind of `quantities`, least and most, and what it is
+    "resolution": ("length", 0.0, 100.0, "of a pixel"),
+    "max_speed": ("speed", 0.0, 50.0, "of the robot"),
+    "max_turn_rate": ("turn rate", 0.0, 50.0, "of the robot"),
+    "encoder_noise": ("length over a metre", 0.0, 1.0, "of the robot"),
+    "scan_period": ("time", 0.0, 100.0, "of the robot"),
+    "time_offset": ("time", -10.0, 10.0, "of the robot"),
+    "wheel_base_scale": ("ratio", 0.0, 5.0, "of the robot"),
+    "odometry_factor": ("ratio", 1e-3, 1e3, "on the standard deviations of Q"),
+    "sensor_factor": ("ratio", 1e-3, 1e3, "on the standard deviations of R"),
+    "max_landmarks": ("number", 1.0, 1e4, "capacity of the filter"),
 }
 LIFE = {f"life.{key}": key for key in life_file.SETTINGS}
 SETTINGS = (*TEXTS, *NUMBERS, *LIFE)
@@ -64,6 +65,8 @@ def value_of(path: Path, where: str, name: str, given: Any) -> Any:
     Raises:
         InputError: It is not of its kind, or not possible.
     """
+    if name == "unit" and isinstance(given, int | float) and not isinstance(given, bool):
+        given = f"{given!r}"  # metres of a unit
     if name in TEXTS:
         if not isinstance(given, str) or given not in CHOICES.get(name, (given,)):
             field = f"{where}.{name}"
@@ -71,9 +74,9 @@ def value_of(path: Path, where: str, name: str, given: Any) -> Any:
         return given
     if name in LIFE:
         return life_file.number(Table(path, f"{where}.life", {}), LIFE[name], given)
-    kind, least, _ = NUMBERS[name]
+    kind, least, most, _ = NUMBERS[name]
     table = Table(path, where, {})
-    found = table.checked(name, given, kind, least, 1e6)
+    found = table.checked(name, given, kind, least, most)
     if found is None or (name in WHOLE and found != int(found)):
         raise table.error(name, f"{given!r} is no whole number")
     return int(found) if name in WHOLE else found
@@ -82,9 +85,9 @@ def value_of(path: Path, where: str, name: str, given: Any) -> Any:
 def number(
     path: Path, field: str, given: Any, least: float, most: float, *, whole: bool = False
 ) -> float:
-    """A number of a file, in [least, most]; InputError if it is none."""
+    """A finite number of a file, in [least, most]; InputError if it is none."""
     is_number = isinstance(given, int | float) and not isinstance(given, bool)
-    if not is_number or math.isnan(given) or (whole and given != int(given)):
+    if not is_number or not math.isfinite(given) or (whole and given != int(given)):
         wanted = "whole number" if whole else "number"
         raise InputError(f"is {given!r}, not a {wanted}", path=path, field=field)
     if not least <= given <= most:

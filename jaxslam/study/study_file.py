@@ -47,6 +47,7 @@ from scipy.stats import qmc
 
 from jaxslam.io import toml_or_json
 from jaxslam.io.errors import InputError
+from jaxslam.io.quantities import Table
 from jaxslam.study.costs import Given, costs_of
 from jaxslam.study.settings import (
     TEXTS,
@@ -62,6 +63,7 @@ from jaxslam.study.settings import (
 
 MAX_VARIANTS = 1000
 MAX_TRIALS = 10**6
+MAX_SUCCESS = 100.0  # [m]
 
 
 class StudyFile(NamedTuple):
@@ -91,7 +93,10 @@ def read(path: str | PathLike) -> StudyFile:
         InputError: It cannot be read, holds something else, or asks for what is not possible.
     """
     path = Path(path)
-    given = toml_or_json.read(path, "see jaxslam.study.study_file")
+    advice = "see jaxslam.study.study_file"
+    given = toml_or_json.read(path, advice)
+    if not given:
+        raise InputError("asks for nothing", path=path, advice=advice)
     known = ("trials", "seed", "success_m", "base", "cost", "vary", "variant", "sample")
     for key in given:
         if key not in known:
@@ -103,7 +108,7 @@ def read(path: str | PathLike) -> StudyFile:
         raise InputError(problem, path=path, field=kinds[0], advice="write one of them")
     trials = number(path, "trials", given.get("trials", 100), 1, MAX_TRIALS, whole=True)
     seed = number(path, "seed", given.get("seed", 0), 0, 2**32 - 1, whole=True)
-    success = number(path, "success_m", given.get("success_m", 0.5), 1e-6, 1e6)
+    success = number(path, "success_m", given.get("success_m", 0.5), 1e-6, MAX_SUCCESS)
     make: Callable[..., list[Given]]
     make = (
         {"vary": _combinations, "variant": _listed, "sample": _sampled}[kinds[0]] if kinds else _one
@@ -139,18 +144,16 @@ def _combinations(path: Path, given: Any, base: Settings, seed: int) -> list[Giv
 
 def _listed(path: Path, given: Any, base: Settings, seed: int) -> list[Given]:
     """Variants one by one."""
-    if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
+    if not isinstance(given, list) or not given or not all(isinstance(x, dict) for x in given):
         raise InputError("is no [[variant]]", path=path, field="variant")
     found = []
     for index, one in enumerate(given):
         field = f"variant {index + 1}"
-        name = one.get("name")
+        name = Table(path, field, one).text("name")
         rest = {k: x for k, x in one.items() if k not in ("name", "cost")}
         own, cost = settings_of(path, field, rest), one.get("cost")
         if cost is not None:
             cost = number(path, f"{field}.cost", cost, 0.0, math.inf)
-        if name is not None and not isinstance(name, str):
-            raise InputError("is no text", path=path, field=f"{field}: name")
         text = ", ".join(text_of(k, x) for k, x in own.items())
         found.append(Given(name or text or "base", base | own, cost))
     return found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.cli import main
-from jaxslam.cli.life_options import leaving, leaving_note, life_of
+from jaxslam.cli.life_options import check_moved_at, leaving, leaving_note, life_of
 from jaxslam.cli.world_options import Building, read_building
 from jaxslam.core.scan import Lidar
 from jaxslam.io.errors import InputError
@@ -39,6 +39,11 @@ def test_doors_and_furniture_are_found_where_they_are_asked_for():
     np.testing.assert_allclose(moved.world.walls, SQUARE)
     np.testing.assert_allclose(moved.life.movers.before, CHAIR)
     assert len(moved.life.materials) == 4 and float(moved.life.traffic.moved_at) == 9.0
+    robot = Robot(scan_period=0.5)
+    check_moved_at(moved.life, robot, 19)
+    with pytest.raises(InputError, match="moved_at is 9 s, and the drive ends after 8 s; give an"):
+        check_moved_at(moved.life, robot, 17)
+    check_moved_at(found.life, robot, 2)  # nothing is moved, at infinity
     with pytest.raises(
         InputError, match="moved needs loose furniture; none can be moved in a room"
     ):
@@ -57,6 +62,13 @@ def test_the_share_of_beams_that_leave_is_that_of_the_open_angle():
     assert float(found.beyond_range) > float(found.no_wall)
     assert leaving_note(found, 5.0).startswith(f"{float(found.no_wall):.1%} of the beams along")
     assert float(leaving(ROUND, World(SQUARE), Robot(), PATH).no_wall) == 0.0
+
+
+def test_a_drive_that_sees_no_wall_is_refused():
+    """As where walls in millimetres are taken as metres."""
+    message = r"no beam along the drive meets a wall within 5 m, the walls span 8000 m x 8000 m; ch"
+    with pytest.raises(InputError, match=message):
+        leaving(ROUND, World(1000.0 * SQUARE), Robot(), PATH + 1000.0)
 
 
 @pytest.mark.parametrize(

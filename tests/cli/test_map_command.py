@@ -158,7 +158,7 @@ def test_map_does_not_replace_the_map_of_a_run(refused, tmp_path):
         ("resolution: 0.1", "resolution: 1.0e-4", "resolution: 0.0001 is not between 0.001 and"),
         ("-2.0, 1.0, 0.0", "1.0e+9, 0, 0", "origin: the map has coordinates of 1e+09, beyond 1e"),
         ("-2.0, 1.0, 0.0", "0, 9999995.0, 0", "origin: the map has coordinates of 1e+07, beyond"),
-        ("-2.0, 1.0, 0.0", "0, 0, 1.0e+8", "origin: the map has coordinates of 1e+08, beyond"),
+        ("-2.0, 1.0, 0.0", "0, 0, 1.0e+8", "origin: 1e+08 is no yaw in radians"),
     ],
 )
 def test_map_refuses_what_other_commands_would(refused, tmp_path, field, value, problem):

@@ -7,6 +7,7 @@ import pytest
 
 from jaxslam.cli import main, study_command, study_variants
 from jaxslam.io.errors import InputError
+from jaxslam.io.robot_file import EXAMPLE
 from jaxslam.study import kept_trials, runner, study_file
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.processes import Group, LostProcessError
@@ -30,6 +31,11 @@ life.people = 4
 def folder(tmp_path, monkeypatch):
     (tmp_path / "p.csv").write_text("1.0,0.9\n2.2,0.9\n")
     (tmp_path / "w.csv").write_text("x1,y1,x2,y2\n0,0,4,0\n4,0,4,4\n4,4,0,4\n0,4,0,0\n")
+    (tmp_path / "big.toml").write_text(EXAMPLE.replace('length = "0.5 m"', 'length = "4 m"'))
+    slides = EXAMPLE.replace("differential", "holonomic").replace("[1.004, 0.998]", "1.004")
+    noise = 'encoder_noise = "4 mm"      # of a wheel, over one metre'
+    slides = slides.replace(noise, 'slip_noise = ["5 mm", "8 mm", "1 deg"]')
+    (tmp_path / "h.toml").write_text(slides)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -62,9 +68,14 @@ def said_of(folder, text, capsys, *more):
         ('path = "p.csv"\nlife.moved = 1\n', "life.moved: says nothing without life.moved_at;"),
         ('path = "p.csv"\nlife = "none.toml"\n', "none.toml: does not exist"),
         ('path = "p.csv"\nscanner = "LDS-01"\nscan_period = 0.05\n', "LDS-01 scans every 0.2 s"),
-        ('path = "p.csv"\nodometry_factor = 0\n', "odometry_factor and sensor_factor are above 0"),
+        ('path = "p.csv"\nodometry_factor = 0\n', "base.odometry_factor: 0 is not between 0.00"),
         ('path = "p.csv"\ndrive = "route"\n', "--drive: is not for a drive that --path gives"),
         ('path = "p.csv"\nscan_period = 0\n', "robot.scan_period is 0.0, not above 0"),
+        (
+            'path = "p.csv"\nrobot = "h.toml"\nencoder_noise = 0.01\n',
+            "encoder_noise says nothing of",
+        ),
+        ('path = "p.csv"\nrobot = "big.toml"\n', "p.csv: path comes within"),
         ("life.persons = 2\n", "base: life.persons is not known; did you mean life."),
     ],
 )
@@ -98,12 +109,42 @@ def test_variants_have_the_settings_of_the_study(folder):
     assert study_variants.prepare(study_file.read(folder / "s.toml")).variants[0].life is None
 
 
+def test_layers_of_a_drawing_are_those_of_simulate(folder, capsys):
+    def line(layer, *points):
+        shape = {"type": "LineString", "coordinates": points}
+        return {"type": "Feature", "properties": {"layer": layer}, "geometry": shape}
+
+    walls = line("walls", [0, 0], [4, 0], [4, 4], [0, 4], [0, 0])
+    lines = [walls, line("axes", [1.5, 0], [1.5, 4]), line("door", [3, 0], [3, 1])]
+    content = {"type": "FeatureCollection", "features": lines}
+    (folder / "w.geojson").write_text(json.dumps(content))
+    text = '[base]\nworld = "w.geojson"\npath = "p.csv"\n'
+    assert "path goes through a wall at x 1.50" in said_of(folder, text, capsys)
+    (folder / "s.toml").write_text(text + 'layers = "walls, door"\n')
+    (found,) = study_variants.prepare(study_file.read(folder / "s.toml")).variants
+    assert len(found.world.walls) == 5
+    assert "'wall' is no layer" in said_of(folder, text + 'layers = "wall"\n', capsys)
+
+
 def test_a_value_that_is_the_default_is_no_other_variant(folder, capsys):
     base = '[base]\npath = "p.csv"\n[[variant]]\nname = "as it is"\n'
     other = '[[variant]]\nname = "so fast"\nmax_speed = 0.6\n'
     assert "variants: 'as it is' and 'so fast' are the same" in said_of(
         folder, base + other, capsys
     )
+
+
+def test_variants_that_differ_in_what_says_nothing_are_noted(folder):
+    """All combinations are run, as asked: without people their speed changes nothing."""
+    text = '[base]\npath = "p.csv"\n[vary]\nlife.speed = [1, 2]\nlife.people = [0, 3]\n'
+    (folder / "s.toml").write_text(text)
+    found = study_variants.prepare(study_file.read(folder / "s.toml"))
+    assert len(found.variants) == 4
+    same = [note for note in found.notes if "same trials" in note]
+    assert same == [
+        "'speed 1, people 0' and 'speed 2, people 0' have the same trials: "
+        "what they differ in says nothing"
+    ]
 
 
 def test_a_file_of_life_is_that_of_simulate(folder, capsys):
@@ -138,9 +179,12 @@ def test_several_processes_keep_trials_that_this_one_reads(tmp_path, monkeypatch
         lambda group, work, *given: said.append((work, given)) or [700.0, 600.0],
     )
     kept = [Collected("record", 1.0, 500.0)]
-    monkeypatch.setattr(study_command, "work", lambda *given: kept)
+    own = {"num_trials": 4, "seed": 7, "folder": tmp_path}
+    read = {}
+    monkeypatch.setattr(study_command, "run_shown", lambda _, **given: read.update(given) or kept)
     found = study_command._run(["variant"], 4, 7, tmp_path, group)
     assert found == [Collected("record", 1.0, 1300.0)]  # the memory of both
+    assert read == own
     assert said == [(study_command._share, (["variant"], 4, 7, tmp_path))]
     assert study_command._run(["variant"], 4, 7, tmp_path, group._replace(own=(2,))) is None
 

@@ -11,6 +11,7 @@ from jaxslam.core.maps import OccupancyMap
 from jaxslam.io import ros_map
 from jaxslam.io.errors import InputError
 from jaxslam.simulation import path_following, worlds
+from jaxslam.simulation.path_checks import check_path_in_world
 
 WALLS = "0,0,6,0\n6,0,6,4\n6,4,0,4\n0,4,0,0\n3,0,3,2.5\n"
 
@@ -61,6 +62,23 @@ def test_what_was_found_on_the_path_is_noted(plan, tmp_path):
     )
 
 
+def test_a_drive_inside_of_a_column_is_noted(plan, tmp_path):
+    with open(plan, "a") as file:
+        file.write("0.5,0.5,2,0.5\n2,0.5,2,2\n2,2,0.5,2\n0.5,2,0.5,0.5\n")
+    inside = read_building(str(plan), path_of(tmp_path, [(1, 1), (1.6, 1), (1.6, 1.6)]))
+    assert inside.notes[-1] == "around the path walls enclose 1.5 m x 1.5 m of 6.0 m x 4.0 m"
+    outside = read_building(str(plan), path_of(tmp_path, [(2.5, 1), (2.5, 3)]))
+    assert not any("enclose" in note for note in outside.notes)
+
+
+def test_waypoints_of_a_drawing_in_another_unit_are_in_metres(plan, tmp_path):
+    path = path_of(tmp_path, [(0.4, 0.4), (0.4, 0.9)])
+    found = read_building(str(plan), path, unit="ft")
+    assert found.notes == (f"waypoints of {path} are in metres, whatever the unit of {plan}",)
+    np.testing.assert_allclose(found.path[0], (0.4, 0.4))
+    assert not any("waypoints" in x for x in read_building(str(plan), path).notes)
+
+
 def test_a_path_is_in_the_coordinates_of_the_file(tmp_path):
     shift = np.array([500000.0, 5300000.0])
     rows = np.array([row.split(",") for row in WALLS.split()], float) + np.tile(shift, 2)
@@ -91,6 +109,25 @@ def test_paths_that_cannot_be_driven_end_with_one_line(plan, tmp_path, capsys, p
     assert not (tmp_path / "out").exists()
 
 
+def test_a_robot_that_does_not_fit_is_refused(tmp_path, plan):
+    path = path_of(tmp_path, [(1, 1), (1, 3)])
+    assert read_building(str(plan), path, robot_radius=0.9).path[0].tolist() == [1.0, 1.0]
+    for world, file, radius in ((str(plan), path, 1.2), ("office", None, 0.6)):
+        with pytest.raises(
+            InputError, match=rf"within .* the robot's \[body\] reaches {radius}0 m"
+        ):
+            read_building(world, file, robot_radius=radius)
+    with pytest.raises(InputError, match="--drive: .*radius"):
+        read_building("office", drive="patrol", robot_radius=3.0)
+
+
+def test_a_drive_that_is_found_keeps_the_radius_of_the_robot(plan):
+    for radius in (0.3, 0.7):
+        building = read_building(str(plan), drive="patrol", robot_radius=radius)
+        found = check_path_in_world(building.path, building.world)
+        assert radius <= found.clearance < radius + 0.5
+
+
 def test_a_path_through_a_map_starts_in_free_space(tmp_path):
     pytest.importorskip("yaml", reason="pip install 'jaxslam[ros]'")
     occupied = np.zeros((60, 60), bool)
@@ -101,7 +138,9 @@ def test_a_path_through_a_map_starts_in_free_space(tmp_path):
     ros_map.write(tmp_path / "map.yaml", OccupancyMap(occupied, free, 0.1, np.zeros(3)))
     world = str(tmp_path / "map.yaml")
     found = read_building(world, path_of(tmp_path, [(1.5, 1.5), (1.5, 2.5)]))
-    assert len(found.world.walls) == 8
+    assert len(found.world.walls) == 8 and found.notes[1:] == ()
+    through = read_building(world, path_of(tmp_path, [(1.5, 2), (4.5, 2), (4.5, 4.5)]))
+    assert through.notes[1] == "1.5 m of the path are where the map is unknown"
     for start, kind in (((0.7, 0.7), "occupied"), ((1.5, 4), "unknown"), ((-1, 1), "left")):
         path = path_of(tmp_path, [start, (1.5, 1.5)])
         with pytest.raises(InputError, match=f"starts at .* m, where the map is {kind}; start in"):

@@ -7,6 +7,7 @@ import pytest
 
 from experiments import paired_trials
 from jaxslam.study import runner
+from jaxslam.study.kept_trials import Collected
 from jaxslam.study.outcomes import Outcomes
 
 N, T = 400, 5
@@ -25,7 +26,8 @@ def test_the_ratio_is_that_of_what_trials_do_not_have_in_common(tmp_path, monkey
     rng = np.random.default_rng(0)
     common = rng.normal(1.0, 0.1, N)
     own = [outcomes(common + rng.normal(0.0, s, N)) for s in [0.05] * (len(variants) - 1)]
-    monkeypatch.setattr(runner, "run", lambda *_, **__: [outcomes(common), *own])
+    found = [Collected(one, 1.0, 1.0) for one in (outcomes(common), *own)]
+    monkeypatch.setattr(runner, "run_timed", lambda *_, **__: found)
     assert paired_trials.main(["--out", str(tmp_path), "--steps", "5"]) == 0
     numbers = json.loads((tmp_path / "paired_trials.json").read_text())
     wanted = 0.05 / np.sqrt(2 * 0.1**2 + 0.05**2)

@@ -7,6 +7,7 @@ import pytest
 
 from experiments import study
 from jaxslam.simulation import named_worlds
+from jaxslam.study import runner
 from jaxslam.study.kept_trials import Collected
 from jaxslam.study.outcomes import Outcomes
 
@@ -37,7 +38,7 @@ def made_up(variants, folder=None, **_):
 
 def test_a_variant_for_each_scanner_building_and_number_of_people(variants):
     assert len(variants) == len({one.name for one in variants}) == 27
-    programs = {study.runner.program_of(one) for one in variants}
+    programs = {runner.program_of(one) for one in variants}
     assert len(programs) == 3  # people are numbers that are traced
     assert {float(one.life.traffic.people) for one in variants} == {0.0, 5.0, 20.0}
     assert all(one.path.shape[1] == 2 and len(one.path) < 600 for one in variants)
@@ -46,7 +47,7 @@ def test_a_variant_for_each_scanner_building_and_number_of_people(variants):
 
 
 def test_the_figure_is_drawn_from_its_numbers(variants, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(study.runner, "run_timed", made_up)
+    monkeypatch.setattr(runner, "run_timed", made_up)
     monkeypatch.setattr(study, "variants_of", lambda *_: variants)
     assert study.main(["--out", str(tmp_path), "--runs", str(N)]) == 0
     numbers = json.loads((tmp_path / "study.json").read_text())

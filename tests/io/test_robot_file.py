@@ -225,6 +225,34 @@ def test_one_number_changes_the_beams_of_a_preset(read, lines, expected):
     assert scanner.precision == scanner_presets.preset("LDS-01").precision
 
 
+def test_what_is_better_than_the_source_of_a_preset_is_noted(read):
+    text = 'preset = "LDS-01"\nscan_rate = "50 Hz"\nrange_max = "3 m"\nrange_min = "1 cm"'
+    notes = [x for x in read(with_scanner(text)).notes if "by its source" in x]
+    assert notes == [
+        "preset LDS-01: scan_rate is 50 Hz, and 5 Hz by its source",
+        "preset LDS-01: range_min is 0.01 m, and 0.12 m by its source",
+    ]
+    assert not any("source" in x for x in read(with_scanner('preset = "LDS-01"')).notes)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (
+            'range_noise = "5 mm"\nprecision = "9 mm"',
+            "scanner.precision: says nothing beside range",
+        ),
+        (
+            'range_noise = ["5 mm", "9 mm from 20 m"]',
+            "range_noise: a piece from 20 m says nothing: ",
+        ),
+    ],
+)
+def test_errors_that_say_nothing_are_refused(read, lines, message):
+    with pytest.raises(InputError, match=message):
+        read(with_scanner(f'preset = "LDS-01"\n{lines}'))
+
+
 def test_errors_of_a_preset_give_place_to_those_of_the_file(read):
     text = 'preset = "TiM571"\naccuracy = ["20 mm", "2 % from 2 m"]'
     scanner = read(with_scanner(text)).robot.scanner

@@ -127,6 +127,7 @@ def test_a_missing_field_is_named(write, field):
         {"origin": "[0, 0]"},
         {"origin": "[0, 0, east]"},
         {"origin": "[0, 0, .nan]"},
+        {"origin": "[0, 0, 90]"},
         {"negate": 2},
         {"negate": "never"},
         {"occupied_thresh": 1.5},

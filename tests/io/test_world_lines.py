@@ -94,12 +94,31 @@ def test_what_may_be_degrees_needs_a_unit(tmp_path):
         read_world(file, unit="m")
 
 
+@pytest.mark.parametrize("name", ["plan.csv", "plan.geojson"])
+def test_a_building_of_kilometres_needs_a_unit(tmp_path, name):
+    """As a file in millimetres would be, of which nothing says so."""
+    file = tmp_path / name
+    walls = 1000.0 * np.array(SIDES)
+    if name == "plan.csv":
+        file.write_text("\n".join(",".join(map(str, row)) for row in walls))
+    else:
+        geojson(file, (line((1000.0 * np.array(CLOSED)).tolist()), None))
+    with pytest.raises(InputError, match="is 6e.03 m x 4e.03 m, not the size of a building.*unit"):
+        read_world(file)
+    np.testing.assert_allclose(read_world(file, unit="mm").world.walls, SIDES)
+    np.testing.assert_allclose(read_world(file, unit="m").world.walls, walls)
+
+
 @pytest.mark.parametrize(
     "content, message",
     [
         ("{", r":1: is not JSON"),
         ('{"type": "LineString", "type": "Point"}', "has the key 'type' twice"),
         ("[1]", "is no object of GeoJSON"),
+        (
+            '{"type": "Feature", "geometry": {"type": "Point", "crs": {"a": 1}}}',
+            "geometry: has a crs of its own; give one, at the top of the file",
+        ),
         ('{"type": "Topology"}', "coordinates: 'Topology' is no geometry"),
         ('{"type": "FeatureCollection"}', "has no list features"),
         ('{"type": "LineString", "coordinates": [[0, 0], [1]]}', r"coordinates\[1\]: \[1\] is no"),
@@ -128,8 +147,10 @@ def test_csv_of_walls(tmp_path, mark):
     file.write_text("# a room\n\n" + "\n".join(mark.join(map(str, row)) for row in SIDES))
     found = read_world(file)
     np.testing.assert_array_equal(found.world.walls, SIDES)
-    assert found.notes == ()
-    np.testing.assert_allclose(read_world(file, unit="2").world.walls, 2 * SIDES)
+    assert found.notes == ("numbers are taken as metres",)
+    given = read_world(file, unit="2")
+    np.testing.assert_allclose(given.world.walls, 2 * SIDES)
+    assert given.notes == ()
 
 
 def test_csv_with_names_and_a_thickness(tmp_path):
@@ -183,6 +204,16 @@ def test_waypoints_are_read(tmp_path):
         ("p.csv", "y,x\n1,2\n", ":1: x: 'y' is not a number"),
         ("p.csv", "1,2\n1e9,2\n", "has coordinates beyond 1e.07 m"),
         ("p.geojson", '{"type": "Point", "coordinates": [1, 2]}', "has 0 LineStrings, not one"),
+        (
+            "p.geojson",
+            json.dumps(line([[8.0, 48.0], [8.0, 48.5]])),
+            "may have degrees of .*, or write CSV of metres$",
+        ),
+        (
+            "p.geojson",
+            json.dumps(line([[1, 2], [1, 4]]) | {"crs": crs("EPSG:25832")}),
+            "crs: the unit .* EPSG:25832 is not known; leave crs out if it has metres",
+        ),
         ("none.geojson", None, "does not exist"),
         ("none.csv", None, "does not exist"),
     ],

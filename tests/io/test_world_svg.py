@@ -79,6 +79,44 @@ def test_transforms_uses_and_nested_pages_are_applied(tmp_path):
     np.testing.assert_allclose(walls(tmp_path, body), expected, atol=1e-9)
 
 
+BOX = "M4 1 H7 V2 H4 Z"
+SHAPES = {
+    "rect": ('<rect x="4" y="1" width="3" height="1" {}/>', f'<path d="{BOX}" {{}}/>'),
+    "ellipse": (
+        '<ellipse cx="5" cy="2" rx="2" ry="1" {}/>',
+        '<path d="M7 2 A2 1 0 0 1 3 2 A2 1 0 0 1 7 2 Z" {}/>',
+    ),
+    "circle": (
+        '<circle cx="5" cy="2" r="1" {}/>',
+        '<path d="M6 2 A1 1 0 0 1 4 2 A1 1 0 0 1 6 2 Z" {}/>',
+    ),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "transform",
+    [
+        "rotate(30)",
+        "rotate(0.25turn 5 2)",
+        "rotate(180 5,2)",
+        "skewX(20)",
+        "scale(-1 1) translate(-9px)",
+        "matrix(0-1 2 0 1 8)",
+    ],
+)
+def test_a_shape_that_is_turned_is_where_its_path_is(tmp_path, shape, transform):
+    """Of all shapes the paths alone are in the frame of the page in svgelements."""
+    own, path = (
+        walls(tmp_path, text.format(f'transform="{transform}"')).reshape(-1, 2)
+        for text in SHAPES[shape]
+    )
+    tolerance = 2 * CURVE_TOLERANCE
+    np.testing.assert_allclose(own.min(axis=0), path.min(axis=0), atol=tolerance)
+    np.testing.assert_allclose(own.max(axis=0), path.max(axis=0), atol=tolerance)
+    assert np.ptp(own, axis=0).min() > 0.9
+
+
 @pytest.mark.parametrize(
     "shape, centre, radii",
     [
@@ -177,6 +215,23 @@ def test_layers_can_be_picked(tmp_path):
             f"<svg {NAMES}><g transform='turn(3)'/></svg>",
             r"<g> transform: 'turn\(3\)' is malformed",
         ),
+        (
+            f"<svg {NAMES}><path d='M0 0H9' transform='translate(1mm)'/></svg>",
+            r"<path> transform: 'translate\(1mm\)' is malformed; write numbers without units",
+        ),
+        (
+            f"<svg {NAMES}><g style='fill:none;transform: rotate(1 2)'/></svg>",
+            r"<g> transform: 'rotate\(1 2\)' is malformed",
+        ),
+        (
+            f"<svg {NAMES}><style>.a {{text-transform: none; transform: scale(50%)}}</style></svg>",
+            r"<style> transform: 'scale\(50%\)' is malformed",
+        ),
+        (
+            f"<svg {NAMES}><g transform='rotate(9)' transform-origin='5 5'/></svg>",
+            "<g> transform-origin: '5 5' is not applied; write rotate",
+        ),
+        (f"<svg {NAMES}><g style='transform-origin: center'/></svg>", "origin: 'center' is not"),
         (f"<svg {NAMES}><use id='a' href='#a'/></svg>", "has groups or uses too deep"),
         (f"<svg {NAMES}><line x2='1e999' y2='2'/></svg>", "cannot be read|has coordinates beyond"),
         (

@@ -11,6 +11,7 @@ from jaxslam.simulation import drives, kinematics, worlds
 from jaxslam.simulation.arguments import as_robot
 from jaxslam.simulation.path_following import GOAL_TOLERANCE, LOOKAHEAD, densify
 from jaxslam.simulation.robot import Robot, arc_increment
+from jaxslam.simulation.worlds import World
 
 CAR = Robot(
     wheel_base=0.32,
@@ -198,6 +199,31 @@ def test_a_path_with_bends_that_are_too_tight_is_refused():
     wide = CAR._replace(max_steering=0.1)
     with pytest.raises(ValueError, match=r"robot leaves the path by .* turning radius is 3.19 m"):
         drives.num_scans_of_drive(wide, PATH)
+
+
+@pytest.mark.parametrize(
+    "end, mount, message",
+    [
+        ((3.0, 1.9), 0.0, None),
+        (
+            (2.78, 2.25),
+            0.0,
+            r"following the path, the robot goes through a wall at x 2.78, y 2.[12]\d m; keep",
+        ),
+        ((3.0, 1.9), 0.8, r"the scanner, at its mount, goes through a wall at x 3.00"),
+    ],
+)
+def test_a_robot_that_goes_through_a_wall_in_a_bend_is_refused(end, mount, message):
+    """A path around the end of a wall; pure pursuit cuts its bends by some centimetres."""
+    path = densify([(0.0, 0.0), (2.7, 0.0), (2.7, 2.3), (3.3, 2.3), (3.3, 0.0)])
+    world = World(np.array([[end[0], 0.5, *end]]))
+    robot = CART._replace(nominal_mount=(mount, 0.0, 0.0))
+    if message is None:
+        found = drives.num_scans_of_drive(robot, path, world)
+        assert found == drives.num_scans_of_drive(robot, path)
+        return
+    with pytest.raises(ValueError, match=message):
+        drives.num_scans_of_drive(robot, path, world)
 
 
 HURT = {"wheel_scales": (1.05, 1.05), "wheel_base_scale": 0.96, "mount": (0.05, -0.02, 0.03)}

@@ -169,7 +169,7 @@ def simulated(monkeypatch):
 
 
 def test_the_drive_is_by_default_that_of_the_office(simulated, monkeypatch):
-    monkeypatch.setattr(trial_episodes, "num_scans_of_drive", lambda robot, path: len(path))
+    monkeypatch.setattr(trial_episodes, "num_scans_of_drive", lambda robot, path, world: len(path))
     simulate_episodes(KEY, CONFIG, num_trials=3)
     simulate_episodes(KEY, CONFIG, ROBOT, worlds.named("office"), OFFICE, num_trials=3)
     (shape, robot_, walls, path, num_scans), explicit = simulated
@@ -222,6 +222,7 @@ DRIVE = {"robot": ROBOT, "world": "fig07", "path": PATH, "num_scans": 4, "num_tr
         ({"path": np.full((6, 2), np.inf)}, "path holds numbers that are not finite"),
         ({"path": 2.0 * np.arange(14.0).reshape(7, 2)}, "path has points 5.66 m apart; .*densify"),
         ({"path": np.linspace(PATH[0], PATH[-1], 999)}, "40 of them must span 0.5 m: .*densify"),
+        ({"path": PATH + [3.0, 0.0]}, "path goes through a wall at x 5.00, y 2.73 m; keep"),
         ({"num_scans": 0}, "num_scans is 0, not a whole number of at least 1"),
         ({"num_scans": 2.5}, "num_scans is 2.5, not a whole number"),
         ({"num_trials": 0}, "num_trials is 0, not a whole number of at least 1"),

@@ -1,11 +1,15 @@
 """Trials of a study: the same after a stop, paired over variants, refused if of something else."""
 
+from typing import NamedTuple
+
+import jax
 import numpy as np
 import pytest
 
 from jaxslam import Config, NoiseParams
 from jaxslam.core.scan import Lidar
 from jaxslam.io.errors import InputError
+from jaxslam.pipeline.episodes import EPISODE_BATCH
 from jaxslam.simulation import Robot, World, densify, life_in, named
 from jaxslam.study import kept_trials, runner
 from jaxslam.study.runner import Variant, run
@@ -118,3 +122,26 @@ def test_fingerprints_differ_for_all_that_matters():
     assert programs[0] == programs[3] == programs[4] == programs[5]
     assert programs[7] == programs[8] and len(set(programs)) == 5
     assert runner.fingerprint(runner.in_numpy(cases[7]), 3) == runner.fingerprint(cases[7], 3)
+
+
+class Numbers(NamedTuple):
+    trial: np.ndarray
+
+
+@pytest.mark.parametrize("num_trials", [3, 50])
+def test_what_is_timed_has_the_shapes_of_what_was_computed_before(num_trials):
+    """Whatever is compiled for the first results of each size is compiled in the warm-up."""
+    per_round = EPISODE_BATCH * jax.device_count()
+    sizes = []
+
+    def results(total, first):
+        for start in range(first, total, per_round):
+            sizes.append(min(per_round, total - start))
+            yield Numbers(np.arange(start, start + sizes[-1]))
+
+    found = kept_trials.collect(results, Numbers, num_trials, folder=None, mark="")
+    np.testing.assert_array_equal(found.record.trial, np.arange(num_trials))
+    assert sizes[0] == sizes[1] == min(num_trials, per_round)
+    again = len(sizes)
+    kept_trials.collect(results, Numbers, num_trials, folder=None, mark="", warm_up=False)
+    assert len(sizes) - again == again - 1

@@ -81,7 +81,7 @@ def test_samples_fill_their_box_evenly(tmp_path, method):
         ("trials = 2.5\n", "s.toml: trials: is 2.5, not a whole number"),
         ("success_m = true\n", "s.toml: success_m: is True, not a number"),
         ("[base]\nlife.persons = 3\n", "s.toml: base: life.persons is not known"),
-        ("[base]\nlife.missing = 1.5\n", "base.life.missing: 1.5 is not between 0 and 1"),
+        ("[base]\nlife.missing = 1.5\n", "base.life.missing: 1.5 is not between 0 and 0.99"),
         ('[base]\nmax_speed = "fast"\n', "base.max_speed: 'fast' is no speed; write \"1.5 m/s\""),
         ('[base]\ndrive = "zigzag"\n', "base.drive: is 'zigzag', not patrol or route"),
         ("[base]\nworld = 3\n", "base.world: is 3, not name or file of the building"),
@@ -115,6 +115,19 @@ def test_samples_fill_their_box_evenly(tmp_path, method):
             '[[variant]]\nname = "a"\ncost = 2\n[[variant]]\nname = "b"\nmax_speed = 2\n',
             "variant 'b': has no cost, and others have",
         ),
+        (
+            '[vary]\nmax_speed = [1]\n[cost]\nmax_speed = {"1" = 3, "100 cm/s" = 4}\n',
+            "cost.max_speed.100 cm/s: is another cost of 1.0",
+        ),
+        ("[cost]\nbase = inf\n", "cost.base: is inf, not a number"),
+        ("# nothing yet\n", "s.toml: asks for nothing; see jaxslam.study.study_file"),
+        ("variant = []\n", "variant: is no [[variant]]"),
+        ('[[variant]]\nname = " "\n', "variant 1.name: ' ' is no text of one line"),
+        ('[[variant]]\nname = "a\\nb"\n', "variant 1.name: 'a\\nb' is no text of one line"),
+        ("[[variant]]\nname = 5\n", "variant 1.name: 5 is no text of one line"),
+        ("success_m = 500\n", "success_m: is 500, not between 1e-06 and 100"),
+        ("[base]\nmax_landmarks = 1000000\n", "base.max_landmarks: 1000000 is not between 1 and"),
+        ("[base]\ntime_offset = 900\n", "base.time_offset: 900 is not between -10 and 10 s"),
     ],
 )
 def test_what_is_refused_is_one_line(tmp_path, text, message):
@@ -123,9 +136,15 @@ def test_what_is_refused_is_one_line(tmp_path, text, message):
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_the_unit_of_a_drawing_may_be_its_metres(tmp_path):
+    for given in ('"0.1"', "0.1"):
+        settings = read(tmp_path, f"[base]\nunit = {given}\n").variants[0].settings
+        assert settings == {"unit": "0.1"}
+
+
 def test_too_many_variants_are_refused_before_they_are_made(tmp_path):
     values = ", ".join(map(str, range(1, 40)))
-    text = f"[vary]\nmax_speed = [{values}]\nlife.people = [{values}]\nencoder_noise = [{values}]\n"
+    text = f"[vary]\nmax_speed = [{values}]\nlife.people = [{values}]\nsensor_factor = [{values}]\n"
     with pytest.raises(InputError, match="asks for 59319 variants, more than 1000"):
         read(tmp_path, text)
 

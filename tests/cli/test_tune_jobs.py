@@ -10,7 +10,7 @@ from jaxslam.cli import main, tune_command, tune_jobs
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import carmen, mrclam, noise_file, tum
 from jaxslam.simulation import drives as drives_module
-from jaxslam.simulation import trials
+from jaxslam.simulation import trial_episodes
 from jaxslam.tuning import fitting, losses
 
 
@@ -200,7 +200,7 @@ def test_simulated_trials_are_split_into_training_and_heldout_ones(monkeypatch):
         return {"trial": np.arange(num_trials)}
 
     monkeypatch.setattr(drives_module, "num_scans_of_drive", lambda *_: 7)
-    monkeypatch.setattr(trials, "simulate_episodes", simulate)
+    monkeypatch.setattr(trial_episodes, "simulate_episodes", simulate)
     for heldout, test in ((2, [3, 4]), (0, None)):
         job = tune_jobs.simulated_task("office", 3, heldout, None, 0).load()
         np.testing.assert_array_equal(job.train["trial"], [0, 1, 2])

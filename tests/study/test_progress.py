@@ -18,8 +18,8 @@ def test_the_bar_goes_over_the_trials_of_all_variants(monkeypatch, tmp_path, res
         given.update(others, variants=variants)
         for number in range(len(variants)):
             for done in range(resumed, 5):
-                callback(Progress(number, done))
-        callback(Progress(1, 4))
+                callback(Progress(number, done, 4 * number + done))
+        callback(Progress(1, 4, 8))
         return ["found"]
 
     monkeypatch.setattr(runner, "run_timed", made_up)

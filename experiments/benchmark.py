@@ -61,7 +61,9 @@ def chain(seed: int, num_trials: int, repeats: int) -> tuple[common.Numbers, Sca
     keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
 
     def simulate(keys: Key) -> Episode:
-        return trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+        return trial_episodes.simulate_drives(
+            keys, config.frontend, robot, world, path, num_scans=num_scans
+        )
 
     simulated = simulate(keys)
     poses = simulated.truth.reshape(-1, 3)

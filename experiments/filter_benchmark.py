@@ -134,7 +134,9 @@ def latency(seed: int, num_trials: int) -> tuple[Numbers, Episode]:
     config = Config()
     world, robot, path, num_scans = drive_in()
     keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    episodes = trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+    episodes = trial_episodes.simulate_drives(
+        keys, config.frontend, robot, world, path, num_scans=num_scans
+    )
     episode = jax.tree.map(lambda x: x[0], episodes)
     small = config.filter._replace(max_landmarks=64)
     params, belief = NoiseParams.for_simulated_robot(*robot[:2]), init(small, episode.truth[0])

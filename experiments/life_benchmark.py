@@ -57,8 +57,8 @@ def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     life = life_in(plain, patrol, ranges=RANGES, traffic=TRAFFIC, wheels=WHEELS)
 
     def simulate(world: World, path: Any, life: Life | None = None) -> Episode:
-        return trial_episodes.simulate_keys(
-            keys, config, robot, world, path, num_scans=num_scans, life=life
+        return trial_episodes.simulate_drives(
+            keys, config.frontend, robot, world, path, num_scans=num_scans, life=life
         )
 
     def chain(*arguments: Any) -> Any:

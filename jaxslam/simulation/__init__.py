@@ -26,8 +26,8 @@ from jaxslam.simulation.ray_casting import share_leaving as share_leaving
 from jaxslam.simulation.robot import Robot as Robot
 from jaxslam.simulation.scanners import Scanner as Scanner
 from jaxslam.simulation.traffic import Traffic as Traffic
+from jaxslam.simulation.trial_episodes import simulate_drives as simulate_drives
 from jaxslam.simulation.trial_episodes import simulate_episodes as simulate_episodes
-from jaxslam.simulation.trial_episodes import simulate_keys as simulate_keys
 from jaxslam.simulation.trial_episodes import trial_keys as trial_keys
 from jaxslam.simulation.trials import replay_trial as replay_trial
 from jaxslam.simulation.trials import run_trials as run_trials

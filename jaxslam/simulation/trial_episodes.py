@@ -87,32 +87,6 @@ def drive_of(
     return TrialDrive(robot, walls, points, steps, life, matching)
 
 
-def simulate_keys(
-    keys: Key,
-    config: Config,
-    robot: Robot,
-    world: World,
-    path: Array,
-    *,
-    num_scans: int,
-    noise_by_incidence: float = 0.0,
-    life: Life | None = None,
-    match_scans: bool = False,
-) -> Episode:
-    """Simulate one trial of `num_scans` scans for each of the keys (B,)."""
-    return simulate_drives(
-        keys,
-        config.frontend,
-        robot,
-        world,
-        path,
-        num_scans=num_scans,
-        noise_by_incidence=noise_by_incidence,
-        life=life,
-        matching=config.scan_matching if match_scans else None,
-    )
-
-
 @partial(
     jax.jit, static_argnames=("config", "robot", "num_scans", "noise_by_incidence", "matching")
 )
@@ -128,7 +102,10 @@ def simulate_drives(
     life: Life | None = None,
     matching: ScanMatchSpec | None = None,
 ) -> Episode:
-    """`simulate_keys`, compiled for front end and scan matching alone."""
+    """Simulate one trial of `num_scans` scans for each of the keys (B,).
+
+    It is compiled for front end and scan matching alone, not for each filter.
+    """
     one = partial(
         simulate_episode,
         num_scans=num_scans,

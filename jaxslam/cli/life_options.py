@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli.world_options import Building
 from jaxslam.core import polylines
 from jaxslam.core.scan import Lidar
-from jaxslam.core.se2 import compose
+from jaxslam.core.se2_np import compose
 from jaxslam.io import life_file
 from jaxslam.io.errors import InputError
 from jaxslam.simulation import buildings, moving_parts, ray_casting, worlds
@@ -113,10 +112,11 @@ def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
     count = int(np.clip(float(polylines.length(points)) / robot.max_speed, 2, MAX_POSES))
     even = polylines.resample(points, count)
     along = np.gradient(even, axis=0)
-    poses = jnp.asarray(np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])]), float)
+    poses = np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])])
     for mount in (robot.nominal_mount, robot.mount):
-        poses = jax.vmap(compose, in_axes=(0, None))(poses, jnp.asarray(mount, float))
-    found = ray_casting.share_leaving(lidar, world._replace(wall_index=None), poses)
+        poses = compose(poses, np.array(mount, float))
+    given = jnp.asarray(poses, float)
+    found = ray_casting.share_leaving(lidar, world._replace(wall_index=None), given)
     if found.beyond_range > NOTHING_SEEN:
         width, height = np.ptp(np.reshape(world.walls, (-1, 2)), axis=0)
         raise InputError(

@@ -1,8 +1,8 @@
 """The command `jaxslam simulate`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
@@ -25,9 +25,11 @@ from jaxslam.io.output import folder
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.simulation import drives, kinematics
+from jaxslam.simulation import drives, kinematics, trial_map
 from jaxslam.simulation import trials as trials_module
+from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
+from jaxslam.simulation.trial_map import FilteredDrive
 from jaxslam.simulation.wheel_faults import can_fail
 
 OptionalUnit = Annotated[str | None, tyro.conf.arg(metavar="UNIT", help_behavior_hint="")]
@@ -144,20 +146,9 @@ def simulate(
         with name_errors(str(life)):
             check_moved_at(given, simulated, num_scans)
         print(f"{trials} trials of {num_scans} scans", flush=True)
+        about = key, config, params, simulated, walls, points
         with stopwatch() as seconds:
-            groups = trials_module.run_trials(
-                key,
-                config,
-                params,
-                simulated,
-                walls,
-                points,
-                num_trials=trials,
-                num_scans=num_scans,
-                life=given,
-                match_scans=match_scans,
-            )
-            results = _collect(groups, trials)
+            results, first = _run(about, trials, num_scans, given, match_scans)
         lengths = [log_errors.path_length(poses) for poses in np.asarray(results.truth)]
         numbers = summary.evaluate(results) | {
             "ate_rmse_m": log_errors.mean_ate(results),
@@ -165,12 +156,14 @@ def simulate(
             "beams_leaving": open_share._asdict(),
             "seconds": seconds,
         }
-        about = key, config, params, simulated, walls, points
         with name_errors(f"{'the drive' if life is None else life}: trial 0"):
-            true_poses, result = trials_module.replay_trial(
-                *about, trial=0, num_scans=num_scans, life=given, match_scans=match_scans
-            )
-        truth, stamps = np.asarray(true_poses, np.float64), np.arange(num_scans, dtype=float)
+            if first is not None:
+                result = trial_map.slam_result(config, first)
+            else:  # what `run` does, that finds breaks
+                _, result = trials_module.replay_trial(
+                    *about, trial=0, num_scans=num_scans, life=given, match_scans=True
+                )
+        truth, stamps = np.asarray(results.truth[0], np.float64), np.arange(num_scans, dtype=float)
         report.write_results(out_dir, numbers, result.topological_map)
         tum.write(out_dir / "trajectory.tum", stamps, result.poses)
         tum.write(out_dir / "truth.tum", stamps, truth)
@@ -190,6 +183,25 @@ def _robot(path: Path | None, config: Config) -> tuple[Robot, Config]:
         print(f"  {note}")
     lidar = found.robot.scanner.lidar() if found.robot.scanner else config.frontend.lidar
     return found.robot, Config.for_lidar(lidar, frontend=config.frontend, filter=config.filter)
+
+
+def _run(
+    about: tuple, num_trials: int, num_scans: int, life: Life | None, match_scans: bool
+) -> tuple[TrialResult, FilteredDrive | None]:
+    """All trials; and what the map of trial 0 is made of, where its scans are not matched."""
+    given: Any = {"num_trials": num_trials, "num_scans": num_scans, "life": life}
+    if match_scans:
+        groups = trials_module.run_trials(*about, **given, match_scans=True)
+        return _collect(groups, num_trials), None
+    drives: list[FilteredDrive] = []
+
+    def results() -> Iterator[TrialResult]:
+        for group, drive in trials_module.run_trials_and_map(*about, **given):
+            if not drives:
+                drives.append(drive)
+            yield group
+
+    return _collect(results(), num_trials), drives[0]
 
 
 def _collect(groups: Iterable[TrialResult], num_trials: int) -> TrialResult:

@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxslam.core import time_series
 from jaxslam.core.logs import LaserLog, Relations
-from jaxslam.core.se2_np import relative
+from jaxslam.core.se2_np import relative, wrap_angle
 from jaxslam.core.types import Metrics
 from jaxslam.evaluation import consistency, trajectory
 from jaxslam.pipeline.episodes import TrialResult
@@ -18,8 +18,10 @@ Trajectory = tuple[np.ndarray, np.ndarray]
 
 
 def pose_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Errors (..., 3) [m, m, rad] of poses (..., 3), world frame."""
-    return np.asarray(consistency.pose_error(jnp.asarray(poses, float), jnp.asarray(truth, float)))
+    """Errors (..., 3) [m, m, rad] of poses (..., 3), world frame; `pose_error` without JAX."""
+    error = np.asarray(poses, np.float64) - np.asarray(truth, np.float64)
+    error[..., 2] = wrap_angle(error[..., 2])
+    return error
 
 
 def has_heading(reference: Trajectory) -> bool:

@@ -2,10 +2,11 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core.types import Metrics, check_array
+from jaxslam.core.types import Array, Metrics, check_array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, nees, nees_per_dof, pose_error
 from jaxslam.pipeline.episodes import TrialResult
 
@@ -30,11 +31,10 @@ def evaluate(results: TrialResult) -> Metrics:
     """
     arrays = _checked(results)
     good = arrays.finite & np.all(np.isfinite(arrays.estimate), axis=(1, 2))
-    error = np.asarray(pose_error(jnp.asarray(arrays.estimate), jnp.asarray(arrays.truth)))
-    drift = np.asarray(pose_error(jnp.asarray(arrays.dead_reckoning), jnp.asarray(arrays.truth)))
+    poses = arrays.estimate, arrays.dead_reckoning, arrays.truth, arrays.cov
+    error, drift, values = (np.asarray(x) for x in _errors(*map(jnp.asarray, poses)))
     diverged = np.flatnonzero(~good | _far(error, arrays.truth_mask))
     # Until the first motion the pose is certain, and NEES is not defined.
-    values = np.asarray(nees(jnp.asarray(error), jnp.asarray(arrays.cov)))
     certain = np.trace(arrays.cov, axis1=-2, axis2=-1) < CERTAIN_TRACE
     evaluated = good[:, None] & arrays.truth_mask
     has_nees = evaluated & ~certain & np.isfinite(values)
@@ -53,6 +53,15 @@ def evaluate(results: TrialResult) -> Metrics:
         "dead_reckoning": rmse_of(drift[evaluated])
         | {"diverged": int(_far(drift, arrays.truth_mask).sum())},
     }
+
+
+@jax.jit  # one program instead of fifty of one operation each
+def _errors(
+    estimate: Array, dead_reckoning: Array, truth: Array, cov: Array
+) -> tuple[Array, Array, Array]:
+    """Errors (B, T, 3) of the estimate and of dead reckoning, and NEES (B, T)."""
+    error = pose_error(estimate, truth)
+    return error, pose_error(dead_reckoning, truth), nees(error, cov)
 
 
 def _checked(results: TrialResult) -> Any:

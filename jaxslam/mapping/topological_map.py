@@ -168,6 +168,8 @@ def _arcs_between(arcs: ArcTable, node_of: dict[int, int], xy: np.ndarray) -> li
         if arcs.ends[slot, 0] in node_of
         and (arcs.ends[slot, 1] in node_of or arcs.ends[slot, 1] < 0)
     ]
+    if not slots:
+        return []  # and nothing is compiled
     pairs = np.array(
         [[node_of.get(int(landmark), -1) for landmark in arcs.ends[slot]] for slot in slots], int
     ).reshape(-1, 2)

@@ -71,10 +71,25 @@ class TrialResult(NamedTuple):
 
 def filter_episode(config: FilterConfig, params: NoiseParams, episode: Episode) -> TrialResult:
     """Run the filter on one drive, from its true start."""
+    return filter_whole_episode(config, params, episode)[0]
+
+
+def filter_whole_episode(
+    config: FilterConfig, params: NoiseParams, episode: Episode
+) -> tuple[TrialResult, Belief, StepInfo]:
+    """`filter_episode`, with the belief at the end and the diagnostics [T]."""
     belief, info = slam_filter.run_filter(
         config, params, init(config, episode.truth[0]), measurements_of(episode)
     )
-    return trial_result(config, episode, belief, info)
+    return trial_result(config, episode, belief, info), belief, info
+
+
+def filter_whole_batch(
+    config: FilterConfig, params: NoiseParams, episodes: Episode
+) -> tuple[TrialResult, Belief, StepInfo]:
+    """`filter_batch`, not jitted, with the beliefs [B] at the end and the diagnostics [B, T]."""
+    one = partial(filter_whole_episode, config, params)
+    return map_batches(one, episodes, batch_size=EPISODE_BATCH)
 
 
 def trial_result(

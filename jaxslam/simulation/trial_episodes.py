@@ -106,12 +106,40 @@ def simulate_drives(
 
     It is compiled for front end and scan matching alone, not for each filter.
     """
+    return drives_and_scans(
+        keys,
+        config,
+        robot,
+        world,
+        path,
+        num_scans=num_scans,
+        noise_by_incidence=noise_by_incidence,
+        life=life,
+        matching=matching,
+    )[0]
+
+
+def drives_and_scans(
+    keys: Key,
+    config: FrontendConfig,
+    robot: Robot,
+    world: World,
+    path: Array,
+    *,
+    num_scans: int,
+    noise_by_incidence: float = 0.0,
+    life: Life | None = None,
+    matching: ScanMatchSpec | None = None,
+    with_scans: bool = False,
+) -> tuple[Episode, Scan | None]:
+    """`simulate_drives`, not jitted, and the scans [B, T] of each if they are wanted."""
     one = partial(
         simulate_episode,
         num_scans=num_scans,
         noise_by_incidence=noise_by_incidence,
         life=life,
         matching=matching,
+        with_scans=with_scans,
     )
     return lax.map(lambda key: one(key, config, robot, world, path), keys)
 
@@ -127,7 +155,8 @@ def simulate_episode(
     noise_by_incidence: float = 0.0,
     life: Life | None = None,
     matching: ScanMatchSpec | None = None,
-) -> Episode:
+    with_scans: bool = False,
+) -> tuple[Episode, Scan | None]:
     """One trial: drive along `path` (N, 2), scan the world `num_scans` times, extract features.
 
     Scans are matched, too, if `matching` says by which options. The standard deviation of a range
@@ -145,7 +174,7 @@ def simulate_episode(
         life=life,
     )
 
-    return episode_of(config, scan_of, items, odometry, matching=matching)
+    return episode_of(config, scan_of, items, odometry, matching=matching, with_scans=with_scans)
 
 
 def episode_of(
@@ -155,8 +184,9 @@ def episode_of(
     odometry: Array,
     *,
     matching: ScanMatchSpec | None = None,
-) -> Episode:
-    """The episode of a drive whose scans are still to be made, by `drive_and_scan`."""
+    with_scans: bool = False,
+) -> tuple[Episode, Scan | None]:
+    """The episode of a drive whose scans are still to be made, by `drive_and_scan`; and these."""
     matches = None
     if matching is not None:
         # Scan matching takes them in turn, the front end some at a time: they are made before.
@@ -164,11 +194,13 @@ def episode_of(
         empty = scan_matching.empty_submap(matching, config.lidar)
         matches = scan_matching.match_scans(matching, config.lidar, empty, items[1], odometry)[1]
 
-    def features(item: tuple) -> Features:
-        return extract.extract_features(config, item[1] if matching else scan_of(item))
+    def observe(item: tuple) -> tuple[Features, Scan | None]:
+        scan = item[1] if matching else scan_of(item)
+        return extract.extract_features(config, scan), scan if with_scans else None
 
-    extracted = map_batches(features, items, batch_size=extract.SCAN_BATCH)
-    return Episode(truth=items[0], odometry=odometry, features=extracted, scan_matches=matches)
+    features, scans = map_batches(observe, items, batch_size=extract.SCAN_BATCH)
+    episode = Episode(truth=items[0], odometry=odometry, features=features, scan_matches=matches)
+    return episode, scans
 
 
 def trial_keys(key: Key, trials: Array) -> Key:

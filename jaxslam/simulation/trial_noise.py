@@ -107,7 +107,7 @@ def simulate_from_noise(
         draws_of(noise, life), *given, life=life, mount_error=mount_error
     )
 
-    return episode_of(config, scan_of, items, odometry, matching=matching)
+    return episode_of(config, scan_of, items, odometry, matching=matching)[0]
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))

@@ -17,7 +17,7 @@ from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.pipeline import offline
 from jaxslam.pipeline.arguments import as_params
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
+from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_whole_batch
 from jaxslam.pipeline.results import SlamResult
 from jaxslam.simulation.drives import simulate_scans
 from jaxslam.simulation.life import Life
@@ -26,9 +26,10 @@ from jaxslam.simulation.trial_episodes import (
     ROBOT,
     TrialDrive,
     drive_of,
-    simulate_drives,
+    drives_and_scans,
     trial_keys,
 )
+from jaxslam.simulation.trial_map import FilteredDrive
 from jaxslam.simulation.worlds import World
 
 
@@ -109,14 +110,29 @@ def _filter_group(
     matching: ScanMatchSpec | None,
     common: _Common,
     numbers: Array,
-) -> TrialResult:
-    """Simulate the trials with the numbers (EPISODE_BATCH,) in turn, and filter them together."""
+) -> tuple[TrialResult, FilteredDrive | None]:
+    """Simulate the trials with the numbers (EPISODE_BATCH,) in turn, and filter them together.
+
+    Returns:
+        The results, and what the first one's map is made of; None where scans are matched.
+    """
     keys = trial_keys(jax.random.wrap_key_data(common.key, impl=key_type), numbers)
-    given = frontend, robot, common.world, common.path
-    episodes = simulate_drives(
-        keys, *given, num_scans=num_scans, life=common.life, matching=matching
+    episodes, scans = drives_and_scans(
+        keys,
+        frontend,
+        robot,
+        common.world,
+        common.path,
+        num_scans=num_scans,
+        life=common.life,
+        matching=matching,
+        with_scans=matching is None,
     )
-    return filter_batch(config, common.params, episodes)
+    results, beliefs, infos = filter_whole_batch(config, common.params, episodes)
+    if scans is None:
+        return results, None
+    drives = FilteredDrive(beliefs, infos, episodes.features, episodes.odometry, scans)
+    return results, jax.tree.map(lambda x: x[0], drives)
 
 
 # Compiled quickly, it would run a third slower, which pays only below some hundred drives of the
@@ -177,7 +193,45 @@ def run_trials(
     if devices is not None and not len(devices):
         raise ValueError("devices is empty; None stands for all")
     used = jax.devices() if devices is None else devices
-    return _run_groups(key, config, params, given, begin, total, used)
+    groups = _run_groups(key, config, params, given, begin, total, used)
+    return (results for results, _ in groups)
+
+
+def run_trials_and_map(
+    key: Key,
+    config: Config,
+    params: NoiseParams,
+    robot: Robot = ROBOT,
+    world: str | World = "office",
+    path: Any = None,
+    *,
+    num_trials: int,
+    num_scans: int | None = None,
+    life: Life | None = None,
+) -> Iterator[tuple[TrialResult, FilteredDrive]]:
+    """`run_trials` without scan matching; each part with what its first trial's map is made of.
+
+    `trial_map.slam_result` makes the map, without the programs that `replay_trial` compiles.
+
+    Args:
+        key: Key of the experiment; the other arguments, too, are those of `run_trials`.
+        config: Of front end and filter.
+        params: Q and R that the filter assumes.
+        robot: The robot, with its encoder noise.
+        world: Name of the world, or its walls.
+        path: (N, 2) [m, world] to drive along; the world's own by default.
+        num_trials: B, number of trials.
+        num_scans: T, scans of a trial; to the end of the path by default.
+        life: What may go wrong, by `life_in`; None: nothing.
+
+    Raises:
+        ValueError: An argument is not possible; at the call, before the first result is asked for.
+    """
+    params = as_params(params, match_scans=False)
+    given = drive_of(key, config, robot, world, path, num_scans, life, False)
+    total = as_count("num_trials", num_trials)
+    groups = _run_groups(key, config, params, given, 0, total, jax.devices())
+    return ((results, drive) for results, drive in groups if drive is not None)
 
 
 def _run_groups(
@@ -188,22 +242,26 @@ def _run_groups(
     first: int,
     num_trials: int,
     devices: Sequence[jax.Device],
-) -> Iterator[TrialResult]:
+) -> Iterator[tuple[TrialResult, FilteredDrive | None]]:
     """The loop of `run_trials`, whose arguments are checked."""
     common = _Common(jax.random.key_data(key), params, given.world, given.path, given.life)
     key_type = jax.random.key_impl(key)
     static = config.frontend, config.filter, given.robot, given.num_scans, key_type, given.matching
     per_round = EPISODE_BATCH * len(devices)
 
-    def begin(start: int) -> Callable[[], TrialResult]:
+    def begin(start: int) -> Callable[[], tuple[TrialResult, FilteredDrive | None]]:
         # The last round is filled up with its last trial, so that nothing is compiled again.
         numbers = np.minimum(start + np.arange(per_round, dtype=np.int32), num_trials - 1)
         groups = numbers.reshape(-1, EPISODE_BATCH)
         return _SPREAD_GROUPS.begin(*static, common, groups, devices=devices)
 
-    def end(start: int, finish: Callable[[], TrialResult]) -> TrialResult:
+    def end(
+        start: int, finish: Callable[[], tuple[TrialResult, FilteredDrive | None]]
+    ) -> tuple[TrialResult, FilteredDrive | None]:
         wanted = slice(max(0, first - start), num_trials - start)
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[wanted], finish())
+        results, drives = finish()
+        results = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[wanted], results)
+        return results, jax.tree.map(lambda x: x[0].copy(), drives)
 
     pending = None
     # Groups begin at multiples of EPISODE_BATCH, whatever `first` is.

@@ -61,3 +61,11 @@ def test_a_reference_without_headings_gives_no_errors_that_need_them():
     assert numbers["ate_rmse_m"] == pytest.approx(0.0, abs=1e-6)
     assert all(numbers[name] is None for name in log_errors.NEED_HEADING)
     assert not log_errors.has_heading(reference) and log_errors.has_heading((times, poses))
+
+
+def test_errors_of_poses_are_those_of_the_trials_evaluation():
+    random = np.random.default_rng(0)
+    poses, truth = random.normal(0.0, 4.0, (2, 3, 50, 3))
+    found = log_errors.pose_errors(poses, truth)
+    np.testing.assert_allclose(found, consistency.pose_error(poses, truth), atol=1e-12)
+    assert np.abs(found[..., 2]).max() <= np.pi < np.abs((poses - truth)[..., 2]).max()

@@ -11,12 +11,14 @@ from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.grid import GridSpec
+from jaxslam.mapping.config import MappingSpec
 from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import path_following, robot, trial_episodes, trials, worlds
 from jaxslam.simulation.drives import drive, num_scans_of_drive
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.trial_episodes import simulate_episodes
+from jaxslam.simulation.trial_map import slam_result
 from jaxslam.simulation.worlds import World
 
 STEPS = 6
@@ -96,6 +98,62 @@ def test_the_filter_finds_and_uses_landmarks(nine):
     summary = evaluate(tracks)
     assert summary["runs"] == 9 and summary["scans"] == 9 * STEPS and summary["diverged"] == 0
     assert summary["position_rmse_m"] < 0.03
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    """Nine trials, each part of them with what the map of its first one is made of."""
+    return list(trials.run_trials_and_map(KEY, *SETTING, num_trials=9, num_scans=STEPS))
+
+
+def test_what_a_map_is_made_of_is_that_of_the_first_trial_of_each_part(nine, mapped):
+    whole = episodes.concatenate_results(nine)
+    assert_same(episodes.concatenate_results(results for results, _ in mapped), whole)
+    first = 0
+    for results, drive_ in mapped:
+        assert_same(drive_.info.pose, whole.estimate[first])
+        assert_same(drive_.info.pose_cov, whole.cov[first])
+        assert drive_.belief.num_seen.shape == (16,) and drive_.scans.hit.shape == (STEPS, 181)
+        first += len(results.truth)
+
+
+def test_the_map_of_a_trial_has_landmarks_of_its_filter_and_the_rooms_walls(mapped):
+    _, drive_ = mapped[0]
+    result = slam_result(CONFIG, drive_)
+    np.testing.assert_allclose(result.poses, drive_.info.pose, atol=1e-12)
+    graph, belief = result.topological_map, drive_.belief
+    known = np.isin(graph.id, belief.id[belief.num_seen > 0])
+    assert known.any() and result.next_id >= belief.next_id
+    assert len(np.unique(graph.id)) == len(graph.id) and len(graph.arc_lines) > 0
+    row, column = np.nonzero(result.occupancy.occupied)
+    points = result.occupancy.origin[:2] + 0.05 * (np.column_stack([row, column]) + 0.5)
+    start, end = np.split(np.asarray(SETTING[3].walls).reshape(-1, 4), 2, axis=1)
+    along = end - start
+    share = np.sum((points[:, None] - start) * along, axis=2) / np.sum(along**2, axis=1)
+    nearest = start + np.clip(share, 0.0, 1.0)[..., None] * along
+    assert np.hypot(*(points[:, None] - nearest).T).min(axis=0).max() < 0.1
+
+
+def test_a_map_of_the_arcs_of_single_scans_needs_a_replay(mapped):
+    merged = CONFIG._replace(mapping=MappingSpec("merged"))
+    with pytest.raises(ValueError, match="config.mapping.topology is 'merged', not 'grid'; replay"):
+        slam_result(merged, mapped[0][1])
+
+
+@pytest.mark.slow
+def test_the_map_of_a_trial_is_the_one_that_a_replay_makes(mapped):
+    truth, replayed = trials.replay_trial(KEY, *SETTING, trial=0, num_scans=STEPS)
+    results, drive_ = mapped[0]
+    found = slam_result(CONFIG, drive_)
+    np.testing.assert_allclose(truth, results.truth[0], atol=1e-12)
+    np.testing.assert_allclose(found.poses, replayed.poses, atol=1e-9)
+    assert found.next_id == replayed.next_id
+    assert_same(found.occupancy, replayed.occupancy)
+    for one, two in zip(found.topological_map, replayed.topological_map, strict=True):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), one, two)
+    for name in ("landmark_positions", "num_seen", "id", "kind"):
+        one, two = (np.asarray(getattr(x.belief, name)) for x in (found, replayed))
+        np.testing.assert_allclose(one, two, atol=1e-9)
 
 
 def driven(keys, steps):

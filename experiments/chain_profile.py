@@ -46,7 +46,7 @@ def batched(function: Callable) -> Callable:
     return jax.jit(call)
 
 
-def front_end(config: Config, scans: Scan) -> dict[str, tuple]:
+def front_end(config: Config, scans: Scan) -> dict[str, tuple[Any, ...]]:
     """Each part of the front end as a function of all scans, with its arguments."""
     spec = config.frontend
     lidar, (level,) = spec.lidar, spec.pyramid()
@@ -126,13 +126,14 @@ def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
     world, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
     keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    simulated = trial_episodes.simulate_keys(
-        keys, config, robot, world, path, num_scans=num_scans
-    )
+    simulated = trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
     poses = simulated.truth.reshape(-1, 3)
     cast_rays = batched(partial(cast, config.frontend.lidar, world))
     run_filter = jax.jit(partial(episodes.filter_batch, config.filter, params))
-    calls = {"ray_casting": (cast_rays, poses), "filter": (run_filter, simulated)}
+    calls: dict[str, tuple[Any, ...]] = {
+        "ray_casting": (cast_rays, poses),
+        "filter": (run_filter, simulated),
+    }
     calls |= front_end(config, cast_rays(poses))
     taken, count = fastest(calls, repeats=repeats), num_trials * num_scans
     rows = []

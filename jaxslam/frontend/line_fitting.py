@@ -155,8 +155,8 @@ def partition_beams(
         Killick, Fearnhead, Eckley, Optimal detection of changepoints with a linear computational
         cost, 2012.
     """
-    beam = jnp.arange(lidar.num_beams, dtype=jnp.int32)
-    candidate = jnp.arange(num_candidates, dtype=jnp.int32)[:, None]
+    beam = np.arange(lidar.num_beams, dtype=np.int32)
+    candidate = np.arange(num_candidates, dtype=np.int32)[:, None]
 
     def variance(q: Array, foot: Array) -> Array:
         """Variance [1/m^2] of q = 1 / r on a line whose foot has the inverse distance `foot`.
@@ -208,7 +208,7 @@ def partition_beams(
     first, normal = partition(q, breaks | ~scan.hit, scan.hit & ~measured)
     normals = jnp.stack(normal, axis=1)
     size = jnp.sqrt(jnp.maximum(dot(normals, normals), 1e-12))
-    return Partition(_backtrack(beam, first), normals / size[:, None])
+    return Partition(_backtrack(jnp.asarray(beam), first), normals / size[:, None])
 
 
 def _add_beam(

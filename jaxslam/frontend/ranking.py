@@ -24,7 +24,7 @@ def stable_order(key: Array) -> Array:
 
 
 def first_true(mask: Array, count: int) -> tuple[Array, Array]:
-    """Index (count,) int32 of the first entries of a mask (N,) that are true, 0 where there is none.
+    """Index (count,) int32 of the first true entries of a mask (N,), 0 where there are no more.
 
     Also returned is where there is one: (count,) bool.
     """

@@ -16,7 +16,14 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
-from experiments import common, filter_benchmark, life_benchmark, peer_automata, peer_filters
+from experiments import (
+    chain_profile,
+    common,
+    filter_benchmark,
+    life_benchmark,
+    peer_automata,
+    peer_filters,
+)
 from experiments.timing import fastest, pin, seconds
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
@@ -169,6 +176,7 @@ def compute(seed: int, num_trials: int, maps: int, drives: int, repeats: int) ->
         "seed": seed,
         "cores": 1,
         "chain": of_chain,
+        "chain_profile": chain_profile.compute(seed, num_trials, repeats),
         "life": life_benchmark.compute(seed, num_trials, repeats),
         "front_end": frontend(scans, maps, repeats),
         "estimator": of_filter,

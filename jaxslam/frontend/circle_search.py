@@ -6,6 +6,7 @@ searched as well. `junctions` fits them to the walls, and says which are landmar
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jaxslam.core.types import Array
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
 from jaxslam.frontend.pyramid import Level
+from jaxslam.frontend.ranking import first_true, sorted_three, stable_order
 from jaxslam.frontend.tangent_circles import (
     TangentCircles,
     WallSegments,
@@ -54,17 +56,28 @@ def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Arr
         *((np.indices((height, width)) + 0.5) * spec.cell_size + grid_origin(spec)[:, None, None])
     )
     nearest_last = np.argsort(-distance, axis=None, kind="stable").astype(np.int32)
-    rank = np.empty(height * width, np.float32)
+    rank = np.empty(height * width, np.min_scalar_type(-(height * width + 1)))
     rank[nearest_last] = np.arange(1, height * width + 1)
-    key = jnp.where(cells, jnp.asarray(rank.reshape(height, width)), jnp.float32(0.0))
-    key = jnp.pad(key, ((0, -height % BLOCK), (0, -width % BLOCK)))
-    key = jnp.max(key.reshape(key.shape[0] // BLOCK, BLOCK, -1), axis=1)
-    key = jnp.max(key.reshape(len(key), -1, BLOCK), axis=2)
+    key = jnp.where(cells, jnp.asarray(rank.reshape(height, width)), jnp.zeros((), rank.dtype))
+    key = _largest_of_blocks(_largest_of_blocks(key, axis=0), axis=1).astype(jnp.float32)
     top, _ = lax.top_k(key.reshape(-1), min(count, key.size))
     top = jnp.pad(top, (0, count - top.size))
     flat = jnp.asarray(nearest_last)[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
     xy = centre_of(spec, jnp.stack([flat // width, flat % width], axis=-1))
     return xy[:, 0], xy[:, 1], top > 0.0
+
+
+def _largest_of_blocks(key: Array, axis: int) -> Array:
+    """Largest of each `BLOCK` entries along an axis, of those left at its end together."""
+    size = key.shape[axis]
+    whole = size - size % BLOCK
+    # Slices and no reduction of a padded array: these are vectorised.
+    every = (lax.slice_in_dim(key, k, whole, BLOCK, axis) for k in range(BLOCK))
+    key, rest = lax.optimization_barrier((reduce(jnp.maximum, every), key))
+    if whole == size:
+        return key
+    rest = jnp.max(lax.slice_in_dim(rest, whole, size, axis=axis), axis=axis, keepdims=True)
+    return jnp.concatenate([key, rest], axis=axis)
 
 
 def best_apart(score: Array, xy: Array, min_distance: float, count: int) -> tuple[Array, Array]:
@@ -81,14 +94,13 @@ def best_apart(score: Array, xy: Array, min_distance: float, count: int) -> tupl
     Returns:
         Index (count,) of the points, best first, and whether there is one: (count,) bool.
     """
-    order = jnp.argsort(-score, stable=True)
+    order = stable_order(-score)
     x, y, good = xy[order, 0], xy[order, 1], score[order] > 0.0
     dx, dy = x[:, None] - x[None], y[:, None] - y[None]
-    gap = jnp.sqrt(dx * dx + dy * dy)
-    better = jnp.tril(jnp.ones(gap.shape, bool), -1)
-    good &= ~jnp.any(better & good[None, :] & (gap < min_distance), axis=1)
-    best = jnp.argsort(~good, stable=True)[:count]
-    return order[best], good[best]
+    near = dx * dx + dy * dy < min_distance**2
+    good &= ~jnp.any(jnp.triu(near, 1) & good[:, None], axis=0)  # by a better one
+    best, found = first_true(good, count)
+    return order[best], found
 
 
 def _neighbours(circle: TangentCircles) -> tuple[Array, Array, Array]:
@@ -128,12 +140,14 @@ def _starts(
     clearance = jnp.min(foot.distance, axis=0)
     found &= clearance > spec.min_clearance - level.grid.cell_size
     found &= clearance < spec.max_clearance * level.scale + level.grid.cell_size
-    walls_of = jnp.sort(three, axis=0)
-    same = jnp.all(walls_of[:, :, None] == walls_of[:, None], axis=0)
-    same &= jnp.hypot(x[:, None] - x[None], y[:, None] - y[None]) < SAME_START * level.scale
-    found &= ~jnp.any(jnp.tril(same, -1) & found[None], axis=1)
-    first = jnp.argsort(~found, stable=True)[:count]
-    return x[first], y[first], three[:, first], found[first]
+    a, b, c = sorted_three(three)
+    same = (a[:, None] == a[None]) & (b[:, None] == b[None]) & (c[:, None] == c[None])
+    dx, dy = x[:, None] - x[None], y[:, None] - y[None]
+    same &= dx * dx + dy * dy < (SAME_START * level.scale) ** 2
+    # `same` is symmetric: over the first axis the reduction is vectorised.
+    found &= ~jnp.any(jnp.triu(same, 1) & found[:, None], axis=0)
+    first, found = first_true(found, count)
+    return x[first], y[first], three[:, first], found
 
 
 def _search(

@@ -24,7 +24,7 @@ from jaxslam.frontend.local_pyramid import find_pyramid_arcs
 from jaxslam.frontend.pyramid import Level, beyond_finer
 from jaxslam.frontend.segments import POINTS_PER_GAP, Segments, segment_bits, segment_cells
 
-SCAN_BATCH = 16  # scans whose features are extracted together
+SCAN_BATCH = 32  # scans whose features are extracted together
 
 
 def extract_features(config: FrontendConfig, scan: Scan) -> Features:

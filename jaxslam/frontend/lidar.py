@@ -3,11 +3,26 @@
 import math
 
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
 from jaxslam.core.arguments import as_float
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.se2 import unit_vector
 from jaxslam.core.types import Array
+
+ARCTAN = (
+    0.999999886,
+    -0.33332597,
+    0.199859066,
+    -0.141612284,
+    0.104989435,
+    -0.0723485249,
+    0.0397811704,
+    -0.0144013272,
+    0.0024567173,
+)
+"""Coefficients of arctan(r) / r in r^2, of least largest error of r times it on 0 <= r <= 1."""
 
 
 def beam_angles(lidar: Lidar) -> Array:
@@ -31,6 +46,29 @@ def beam_ends(lidar: Lidar, scan: Scan) -> Array:
     return ranges[:, None] * unit_vector(beam_angles(lidar))
 
 
+def bearing(x: Array, y: Array) -> Array:
+    """Bearing (...) [rad] of points (...), -pi to pi; without derivatives.
+
+    `jnp.arctan2(y, x)` to rounding, 2e-7 rad in single precision. On a CPU that calls a function
+    for each number; this is a polynomial in the ratio of the smaller coordinate to the larger one.
+    """
+    if x.dtype != jnp.float32:
+        return jnp.arctan2(y, x)
+    x, y = lax.stop_gradient((x, y))
+    size_x, size_y = jnp.abs(x), jnp.abs(y)
+    steep = size_y > size_x
+    larger = jnp.where(steep, size_y, size_x)
+    ratio = jnp.where(steep, size_x, size_y) / jnp.maximum(larger, np.finfo(np.float32).tiny)
+    square = ratio * ratio
+    value = jnp.full_like(square, ARCTAN[-1])
+    for coefficient in ARCTAN[-2::-1]:
+        value = value * square + coefficient
+    angle = value * ratio
+    angle = jnp.where(steep, 0.5 * jnp.pi - angle, angle)
+    angle = jnp.where(x < 0.0, jnp.pi - angle, angle)
+    return jnp.where(y < 0.0, -angle, angle)
+
+
 def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
     """Whether points lie before the ends of the two beams on either side: in the visible region.
 
@@ -47,7 +85,7 @@ def in_free_view(lidar: Lidar, points: Array, ranges: Array) -> Array:
 
 def is_free_view(lidar: Lidar, x: Array, y: Array, ranges: Array) -> Array:
     """`in_free_view` of points with coordinates x and y (...) [m], robot frame."""
-    beam = (jnp.arctan2(y, x) - lidar.angle_min) / lidar.angle_increment
+    beam = (bearing(x, y) - lidar.angle_min) / lidar.angle_increment
     beam = jnp.where(beam < -0.5, beam + 2 * jnp.pi / lidar.angle_increment, beam)
     low = jnp.clip(jnp.floor(beam).astype(jnp.int32), 0, lidar.num_beams - 2)
     within = (beam > -0.5) & (beam < lidar.num_beams - 0.5)

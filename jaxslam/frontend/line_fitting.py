@@ -11,8 +11,10 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import dot, unit_vector
 from jaxslam.core.types import Array
 from jaxslam.frontend.lidar import beam_angles
+from jaxslam.frontend.trailing_batch import with_trailing_batch
 
 NO_BEAM = np.iinfo(np.int32).max  # first beam of padding
+MAX_EXACT_BEAMS = 4096  # of fewer the square is exact in float32
 
 
 class BeamIntervals(NamedTuple):
@@ -54,17 +56,17 @@ class Moments(NamedTuple):
 
 
 class LineCandidates(NamedTuple):
-    """Candidates for the last segment up to the present beam, with their lines; leading axis C.
+    """Candidates for the last segment up to the present beam, with their lines: C of B scans.
 
     Each candidate is one choice of the segment's first beam. Its line is
     1 / r = a cos(t) + b sin(t), where t is the bearing from that first beam; see `partition_beams`.
 
     Attributes:
-        cost: (C,) of the best partition up to the present beam that ends in this segment.
-        first: (C,) int32 first beam of the segment.
-        heading: Two of (C,), cosine and sine of the bearing of the first beam, robot frame.
-        line: Two of (C,), a and b [1/m].
-        cov: Three of (C,), covariance of a and b: aa, ab, bb [1/m^2].
+        cost: (C, B) of the best partition up to the present beam that ends in this segment.
+        first: (C, B) int32 first beam of the segment.
+        heading: Two of (C, B), cosine and sine of the bearing of the first beam, robot frame.
+        line: Two of (C, B), a and b [1/m].
+        cov: Three of (C, B), covariance of a and b: aa, ab, bb [1/m^2].
     """
 
     cost: Array
@@ -88,7 +90,7 @@ class Partition(NamedTuple):
 
 _Pair = tuple[Array, Array]
 _Carry = tuple[LineCandidates, Array, Array]
-"""Candidates, the least of their costs (), and index of the one that costs most ()."""
+"""Candidates, the least of their costs (B,), and index of the one that costs most (B,)."""
 
 
 def partition_beams(
@@ -153,11 +155,8 @@ def partition_beams(
         Killick, Fearnhead, Eckley, Optimal detection of changepoints with a linear computational
         cost, 2012.
     """
-    q = 1.0 / jnp.maximum(scan.ranges, 0.02)
-    skipped = scan.hit & ~measured
-    beam = jnp.arange(lidar.num_beams, dtype=jnp.int32)
-    ray = unit_vector(beam_angles(lidar)).astype(q.dtype)
-    candidate = jnp.arange(num_candidates, dtype=jnp.int32)
+    beam = np.arange(lidar.num_beams, dtype=np.int32)
+    candidate = np.arange(num_candidates, dtype=np.int32)[:, None]
 
     def variance(q: Array, foot: Array) -> Array:
         """Variance [1/m^2] of q = 1 / r on a line whose foot has the inverse distance `foot`.
@@ -171,32 +170,45 @@ def partition_beams(
 
     def step(carry: _Carry, observed: tuple[Array, ...]) -> tuple[_Carry, tuple[Array, _Pair]]:
         old, least_cost, worst = carry
-        index, q, cosine, sine, must_begin, skip = observed
+        index, q, cosine, sine, must_begin, skip = observed  # of the beam: (B,), or () for all
+        least, q, must_begin, skip = (x[None] for x in (least_cost, q, must_begin, skip))
         foot = jnp.sqrt(old.line[0] ** 2 + old.line[1] ** 2)
         extended = _add_beam(old, q, (cosine, sine), variance(q, foot), outlier_cost)
         extended = extended._replace(cost=jnp.where(must_begin, jnp.inf, extended.cost))
         zero = jnp.zeros_like(q)
         prior_cov = variance(q, q), zero, (max_incidence * q) ** 2
-        begun = LineCandidates(
-            least_cost + segment_cost, index, (cosine, sine), (q, zero), prior_cov
-        )
-        replaced = (candidate == worst) & ~skip
+        begun = LineCandidates(least + segment_cost, index, (cosine, sine), (q, zero), prior_cov)
+        replaced = (candidate == worst[None]) & ~skip
         new = jax.tree.map(
             lambda x, y, z: jnp.where(replaced, x, jnp.where(skip, z, y)), begun, extended, old
         )
-        best, worst = jnp.argmin(new.cost), jnp.argmax(new.cost).astype(jnp.int32)
-        (cos0, sin0), (a, b) = jax.tree.map(lambda x: x[best], (new.heading, new.line))
+        least_cost, most = jnp.min(new.cost, axis=0), jnp.max(new.cost, axis=0)
+        best, worst = (  # the first of equal ones
+            jnp.min(jnp.where(new.cost == x[None], candidate, num_candidates - 1), axis=0)
+            for x in (least_cost, most)
+        )
+        item = jnp.arange(best.size, dtype=jnp.int32)
+        fields = new.first, new.heading, new.line
+        first, (cos0, sin0), (a, b) = jax.tree.map(lambda x: x[best, item], fields)
         normal = cos0 * a - sin0 * b, sin0 * a + cos0 * b  # (a, b) turned to the robot frame
-        return (new, new.cost[best], worst), (new.first[best], normal)
+        return (new, least_cost, worst), (first, normal)
 
-    zero, one = jnp.zeros(num_candidates, q.dtype), jnp.ones(num_candidates, q.dtype)
-    unused = LineCandidates(one * jnp.inf, candidate, (one, zero), (zero, zero), (one, zero, one))
-    must_begin = breaks | ~scan.hit
-    start = unused, jnp.zeros((), q.dtype), jnp.int32(0)
-    _, (first, normal) = lax.scan(step, start, (beam, q, ray[:, 0], ray[:, 1], must_begin, skipped))
+    def best_segments(q: Array, must_begin: Array, skipped: Array) -> tuple[Array, _Pair]:
+        """First beam and normal of the best segment up to each beam, all (R, B)."""
+        zero = jnp.zeros((num_candidates, q.shape[1]), q.dtype)
+        one, index = zero + 1.0, jnp.broadcast_to(candidate, zero.shape)
+        unused = LineCandidates(one * jnp.inf, index, (one, zero), (zero, zero), (one, zero, one))
+        start = unused, zero[0], index[0]
+        ray = unit_vector(beam_angles(lidar)).astype(q.dtype)
+        beams = beam, q, ray[:, 0], ray[:, 1], must_begin, skipped
+        return lax.scan(step, start, beams)[1]
+
+    q = 1.0 / jnp.maximum(scan.ranges, 0.02)
+    partition = with_trailing_batch(best_segments)
+    first, normal = partition(q, breaks | ~scan.hit, scan.hit & ~measured)
     normals = jnp.stack(normal, axis=1)
     size = jnp.sqrt(jnp.maximum(dot(normals, normals), 1e-12))
-    return Partition(_backtrack(beam, first), normals / size[:, None])
+    return Partition(_backtrack(jnp.asarray(beam), first), normals / size[:, None])
 
 
 def _add_beam(
@@ -206,9 +218,9 @@ def _add_beam(
 
     Args:
         candidates: The candidates up to the beam before.
-        q: [1/m] inverse range of the beam.
+        q: (1, B) [1/m] inverse range of the beam.
         ray: Cosine and sine of its bearing.
-        variance: (C,) [1/m^2] of q, on the line of each.
+        variance: (C, B) [1/m^2] of q, on the line of each.
         outlier: Squared standard deviations from which on the beam does not change a line.
     """
     (cosine, sine), (cos0, sin0) = ray, candidates.heading
@@ -261,8 +273,14 @@ def longest_intervals(begins: Array, hit: Array, *, capacity: int) -> BeamInterv
     beam = jnp.arange(num_beams, dtype=jnp.int32)
     next_first = lax.cummin(jnp.where(begins, beam, num_beams), reverse=True)
     last = jnp.append(next_first[1:], num_beams) - 1
-    size, index = lax.top_k(jnp.where(begins & hit, last - beam + 1, 0), capacity)
-    first = jnp.sort(jnp.where(size > 0, index, NO_BEAM))
+    size = jnp.where(begins & hit, last - beam + 1, 0)
+    if num_beams < MAX_EXACT_BEAMS:
+        # `top_k` of reals selects, that of integers sorts. Of equal sizes the first beam counts.
+        key = (size * num_beams + (num_beams - 1 - beam)).astype(jnp.float32)
+        index = lax.top_k(key, capacity)[1]
+    else:
+        index = lax.top_k(size, capacity)[1]
+    first = jnp.sort(jnp.where(size[index] > 0, index, NO_BEAM))
     return BeamIntervals(first, last.at[first].get(mode="fill", fill_value=-1))
 
 

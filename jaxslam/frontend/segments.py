@@ -7,12 +7,13 @@ are the default sources of the Voronoi automaton; the paper's are edge codes (`e
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxslam.core.batching import sequential_vmap_on_cpu
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import dot
 from jaxslam.core.types import Array
-from jaxslam.frontend.grid import GridSpec, cell_of
+from jaxslam.frontend.grid import GridSpec
 from jaxslam.frontend.lidar import beam_ends
 
 
@@ -152,20 +153,25 @@ def segment_cells(
         ValueError: The ranges are not those of one scan of this lidar; while tracing.
     """
     xy, of_beam = beam_ends(lidar, scan), segments.segment_of_beam
-    capacity = segments.valid.size
+    capacity, (height, width) = segments.valid.size, spec.shape
     is_last = jnp.arange(of_beam.size, dtype=jnp.int32) == of_beam.size - 1
     continues = (of_beam == jnp.roll(of_beam, -1)) & ~is_last
     continues &= segments.valid[jnp.minimum(of_beam, capacity - 1)]
-    fraction = jnp.where(
-        continues[:, None], jnp.arange(points_per_gap, dtype=xy.dtype) / points_per_gap, 0.0
-    )
-    drawn = xy[:, None] + fraction[:, :, None] * (jnp.roll(xy, -1, axis=0) - xy)[:, None]
-    drawn = jnp.where((of_beam < capacity)[:, None, None], drawn, jnp.inf)
-    index = cell_of(spec, drawn.reshape(-1, 2))
+    fraction = np.arange(points_per_gap) / points_per_gap
+    fraction = jnp.where(continues[None], jnp.asarray(fraction, xy.dtype)[:, None], 0.0)
+
+    def row(x: Array, low: float) -> Array:
+        """Index (P, R) of the cells along one axis; as of `grid.cell_of`, not yet an integer."""
+        return jnp.floor((x[None] + fraction * (jnp.roll(x, -1) - x)[None] - low) / spec.cell_size)
+
+    # The points of a beam lead, and each axis is an array of its own: both are vectorised.
+    i, j = row(xy[:, 0], spec.x_min), row(xy[:, 1], -spec.y_half)
+    inside = (of_beam < capacity)[None] & (i >= 0.0) & (i < height) & (j >= 0.0) & (j < width)
     # One index for a cell, the last for what is outside: faster than two indices.
-    size = spec.shape[0] * spec.shape[1]
-    cell = jnp.where(index[:, 0] < spec.shape[0], index[:, 0] * spec.shape[1] + index[:, 1], size)
-    values = jnp.repeat(of_beam, points_per_gap).astype(jnp.int8)
+    size = height * width
+    i, j = (jnp.where(inside, x, 0.0).astype(jnp.int32) for x in (i, j))
+    cell = jnp.where(inside, i * width + j, size).reshape(-1)
+    values = jnp.tile(of_beam.astype(jnp.int8), points_per_gap)
 
     def draw(cell: Array, values: Array) -> Array:
         blank = jnp.full(size + 1, -1, jnp.int8)

@@ -1,0 +1,195 @@
+"""Where the time of the whole chain goes: each part of ray casting, front end and filter, a scan.
+
+A part is timed alone, on what the parts before it found, so that the sum of the parts is a little
+above the whole. On a CPU each operation of a compiled program is dispatched, which costs about as
+much as some hundred numbers: `operations` counts them, those of a loop as often as it turns.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import common
+from experiments.timing import fastest
+from jaxslam.core.batching import map_batches
+from jaxslam.core.scan import Scan
+from jaxslam.filtering.noise import NoiseParams
+from jaxslam.frontend import automaton, extract, features, junctions, segmentation
+from jaxslam.frontend.circle_fitting import fit_circles
+from jaxslam.frontend.circle_search import find_circles
+from jaxslam.frontend.dropouts import FilledScan, fill_dropouts
+from jaxslam.frontend.grid import seen_free
+from jaxslam.frontend.line_fitting import Partition, partition_beams
+from jaxslam.frontend.tangent_circles import wall_segments
+from jaxslam.pipeline import episodes
+from jaxslam.pipeline.config import Config
+from jaxslam.simulation import trial_episodes
+from jaxslam.simulation.ray_casting import cast
+
+COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.\-]+) .*\{\s*$")
+CALL = re.compile(r"(?:body|to_apply|branch_computations)=\{?((?:%[\w.\-]+(?:, )?)+)")
+TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
+NO_WORK = re.compile(r" (?:parameter|constant|tuple|get-tuple-element|bitcast)\(")
+
+
+def batched(function: Callable) -> Callable:
+    """`function` of one item for many, in batches of `SCAN_BATCH`."""
+
+    def call(*items: Any) -> Any:
+        return map_batches(lambda x: function(*x), items, batch_size=extract.SCAN_BATCH)
+
+    return jax.jit(call)
+
+
+def front_end(config: Config, scans: Scan) -> dict[str, tuple[Any, ...]]:
+    """Each part of the front end as a function of all scans, with its arguments."""
+    spec = config.frontend
+    lidar, (level,) = spec.lidar, spec.pyramid()
+
+    def partition(filled: FilledScan) -> Partition:
+        found = spec.segments
+        return partition_beams(
+            lidar,
+            filled.scan,
+            filled.jump,
+            filled.measured,
+            max(lidar.range_std, 0.005),
+            segment_cost=found.segment_cost,
+            outlier_cost=found.outlier_cost,
+            num_candidates=found.num_candidates,
+            roughness_std=found.roughness_std,
+            roughness_length=found.roughness_length,
+        )
+
+    fill = batched(partial(fill_dropouts, lidar, spec.segments))
+    segment = batched(partial(segmentation.segment_filled, lidar, spec.segments))
+    draw = batched(partial(extract.level_segments, lidar, level))
+    free = batched(partial(seen_free, lidar, level.grid))
+    expand = batched(
+        partial(automaton.expand_encoded, steps=spec.automaton_steps, octagon=True),
+    )
+    mark = batched(lambda own, cells: extract.junction_cells([level], [own], [cells >= 0])[0])
+    search = batched(
+        lambda cells, found: find_circles(
+            [cells], wall_segments(found), [level], spec.features, jnp.float32
+        )[:2]
+    )
+    gate, thick = spec.features.tangency_gate, spec.features.wall_thickness
+    fit = batched(partial(fit_circles, within=gate, thick=thick))
+    select = batched(
+        lambda cells, scan, found: junctions.find_junctions(
+            lidar, [level], spec.features, [cells], scan, found
+        )
+    )
+    others = batched(
+        lambda found: (
+            features.find_corners(spec.features, found),
+            features.find_wall_directions(spec.features, found),
+        )
+    )
+    filled = fill(scans)
+    scan, found = filled.scan, segment(filled)
+    cells = draw(scan, found)
+    start = extract.encode_segments(cells, free(scan))
+    grown = expand(start)
+    marked = mark(grown, cells)
+    return {
+        "front_end": (batched(partial(extract.extract_features, spec)), scans),
+        "dropouts": (fill, scans),
+        "segments": (segment, filled),
+        "segments: partition": (batched(partition), filled),
+        "wall_cells": (draw, scan, found),
+        "free_cells": (free, scan),
+        "automaton": (expand, start),
+        "junction_cells": (mark, grown, cells),
+        "junctions": (select, marked, scan, found),
+        "junctions: circle_search": (search, marked, found),
+        "junctions: circle_fit": (fit, search(marked, found)[0], found),
+        "corners_and_walls": (others, found),
+    }
+
+
+def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
+    """Rows of the profile: `part`, `us_per_scan`, `equations`, `operations` a scan.
+
+    Args:
+        seed: Of the trials.
+        num_trials: Trials of the office drive.
+        repeats: Rounds in which all parts are timed in turns.
+    """
+    config = Config()
+    world, robot, path, num_scans = common.drive_in()
+    params = NoiseParams.for_simulated_robot(*robot[:2])
+    keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
+    simulated = trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+    poses = simulated.truth.reshape(-1, 3)
+    cast_rays = batched(partial(cast, config.frontend.lidar, world))
+    run_filter = jax.jit(partial(episodes.filter_batch, config.filter, params))
+    calls: dict[str, tuple[Any, ...]] = {
+        "ray_casting": (cast_rays, poses),
+        "filter": (run_filter, simulated),
+    }
+    calls |= front_end(config, cast_rays(poses))
+    taken, count = fastest(calls, repeats=repeats), num_trials * num_scans
+    rows = []
+    for part, (function, *given) in calls.items():
+        traced = function.trace(*given)
+        executed = executed_operations(traced.lower().compile().as_text())
+        rows.append(
+            {
+                "part": part,
+                "us_per_scan": 1e6 * taken[part] / count,
+                "equations": num_equations(traced.jaxpr.jaxpr),
+                "operations": executed / count,
+            }
+        )
+    return rows
+
+
+def num_equations(jaxpr: Any) -> int:
+    """Number of equations of a jaxpr, with those of the ones inside."""
+    inner = (x for eqn in jaxpr.eqns for value in eqn.params.values() for x in _jaxprs(value))
+    return len(jaxpr.eqns) + sum(map(num_equations, inner))
+
+
+def _jaxprs(value: Any) -> Iterator[Any]:
+    """The jaxprs in a parameter of an equation."""
+    for x in value if isinstance(value, tuple | list) else (value,):
+        x = getattr(x, "jaxpr", x)
+        if hasattr(x, "eqns"):
+            yield x
+
+
+def executed_operations(text: str) -> int:
+    """Operations that a compiled program dispatches, one for a loop whose length is not known.
+
+    Args:
+        text: Optimised HLO, as of `Compiled.as_text`.
+    """
+    bodies: dict[str, list[str]] = {}
+    name, entry = "", ""
+    for line in text.splitlines():
+        begins = COMPUTATION.match(line)
+        if begins and " = " not in line.split("{")[0]:
+            name = begins[1]
+            bodies[name] = []
+            entry = name if line.startswith("ENTRY") else entry
+        elif " = " in line and name:
+            bodies[name].append(line)
+
+    def count(name: str) -> int:
+        total = 0
+        for line in bodies.get(name, ()):
+            total += not NO_WORK.search(line)
+            if " while(" in line or " conditional(" in line or " call(" in line:
+                trips = TRIPS.search(line)
+                inner = [x.strip(" %") for found in CALL.findall(line) for x in found.split(",")]
+                total += (int(trips[1]) if trips else 1) * sum(map(count, inner))
+        return total
+
+    return count(entry)

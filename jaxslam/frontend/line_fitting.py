@@ -200,7 +200,7 @@ def partition_beams(
         unused = LineCandidates(one * jnp.inf, index, (one, zero), (zero, zero), (one, zero, one))
         start = unused, zero[0], index[0]
         ray = unit_vector(beam_angles(lidar)).astype(q.dtype)
-        beams = beam, q, ray[:, 0], ray[:, 1], must_begin, skipped
+        beams = jnp.asarray(beam), q, ray[:, 0], ray[:, 1], must_begin, skipped
         return lax.scan(step, start, beams)[1]
 
     q = 1.0 / jnp.maximum(scan.ranges, 0.02)

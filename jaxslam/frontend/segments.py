@@ -157,8 +157,8 @@ def segment_cells(
     is_last = jnp.arange(of_beam.size, dtype=jnp.int32) == of_beam.size - 1
     continues = (of_beam == jnp.roll(of_beam, -1)) & ~is_last
     continues &= segments.valid[jnp.minimum(of_beam, capacity - 1)]
-    fraction = np.arange(points_per_gap) / points_per_gap
-    fraction = jnp.where(continues[None], jnp.asarray(fraction, xy.dtype)[:, None], 0.0)
+    step = jnp.asarray(np.arange(points_per_gap) / points_per_gap, xy.dtype)
+    fraction = jnp.where(continues[None], step[:, None], 0.0)
 
     def row(x: Array, low: float) -> Array:
         """Index (P, R) of the cells along one axis; as of `grid.cell_of`, not yet an integer."""

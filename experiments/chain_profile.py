@@ -46,7 +46,7 @@ def batched(function: Callable) -> Callable:
     return jax.jit(call)
 
 
-def front_end(config: Config, scans: Scan) -> dict[str, tuple[Any, ...]]:
+def frontend(config: Config, scans: Scan) -> dict[str, tuple[Any, ...]]:
     """Each part of the front end as a function of all scans, with its arguments."""
     spec = config.frontend
     lidar, (level,) = spec.lidar, spec.pyramid()
@@ -99,7 +99,7 @@ def front_end(config: Config, scans: Scan) -> dict[str, tuple[Any, ...]]:
     grown = expand(start)
     marked = mark(grown, cells)
     return {
-        "front_end": (batched(partial(extract.extract_features, spec)), scans),
+        "frontend": (batched(partial(extract.extract_features, spec)), scans),
         "dropouts": (fill, scans),
         "segments": (segment, filled),
         "segments: partition": (batched(partition), filled),
@@ -134,7 +134,7 @@ def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
         "ray_casting": (cast_rays, poses),
         "filter": (run_filter, simulated),
     }
-    calls |= front_end(config, cast_rays(poses))
+    calls |= frontend(config, cast_rays(poses))
     taken, count = fastest(calls, repeats=repeats), num_trials * num_scans
     rows = []
     for part, (function, *given) in calls.items():

@@ -11,9 +11,8 @@ has the density
 of Gaussians for wheels that are right, and a Student t distribution, as a motion changes now and
 then by several standard deviations. Here o is how often of late the scans contradicted the wheels,
 at least `MIN_OUTLIER`, and `GUESSED_OUTLIER` where the log itself says that an increment is a
-guess. Some robots report the speed without its sign, and yet none turns back in a moment: u is
-`MIN_OUTLIER` where the motion backwards is as before, smaller where that is a change, by the tail
-of the same t, and 0 once the wheels have reported driving backwards.
+guess. Some robots report the speed without its sign; so u is `MIN_OUTLIER` until the wheels first
+report driving backwards, and then 0.
 
 The quick match needs one Gaussian near the right place: what the wheels say and the motion before
 are combined by their information, weighted by 1 - o and o.
@@ -183,8 +182,6 @@ def pose_hypotheses(history: MotionHistory, wheels: WheelMotion, before: Array) 
     increments = [wheels.increment, history.increment, backwards]
     poses = jnp.stack([compose(before, increment) for increment in increments])
     variances = jnp.stack([wheels.variance, change_variance(history), wheels.variance])
-    change = difference(history.increment, backwards)
-    unsigned *= jnp.exp(student_tail(jnp.sum(change**2 / change_variance(history))))
     weights = jnp.stack([(1.0 - unsigned) * (1.0 - outlier), (1.0 - unsigned) * outlier, unsigned])
     return PoseHypotheses(poses, variances, weights, before[2])
 

@@ -17,7 +17,12 @@ from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.pipeline import offline
 from jaxslam.pipeline.arguments import as_params
 from jaxslam.pipeline.config import Config
-from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_whole_batch
+from jaxslam.pipeline.episodes import (
+    EPISODE_BATCH,
+    TrialResult,
+    filter_batch,
+    filter_whole_batch,
+)
 from jaxslam.pipeline.results import SlamResult
 from jaxslam.simulation.drives import simulate_scans
 from jaxslam.simulation.life import Life
@@ -108,13 +113,14 @@ def _filter_group(
     num_scans: int,
     key_type: Any,
     matching: ScanMatchSpec | None,
+    with_map: bool,
     common: _Common,
     numbers: Array,
 ) -> tuple[TrialResult, FilteredDrive | None]:
     """Simulate the trials with the numbers (EPISODE_BATCH,) in turn, and filter them together.
 
     Returns:
-        The results, and what the first one's map is made of; None where scans are matched.
+        The results, and what the first one's map is made of; None without `with_map`.
     """
     keys = trial_keys(jax.random.wrap_key_data(common.key, impl=key_type), numbers)
     episodes, scans = drives_and_scans(
@@ -126,18 +132,18 @@ def _filter_group(
         num_scans=num_scans,
         life=common.life,
         matching=matching,
-        with_scans=matching is None,
+        with_scans=with_map,
     )
-    results, beliefs, infos = filter_whole_batch(config, common.params, episodes)
     if scans is None:
-        return results, None
+        return filter_batch(config, common.params, episodes), None
+    results, beliefs, infos = filter_whole_batch(config, common.params, episodes)
     drives = FilteredDrive(beliefs, infos, episodes.features, episodes.odometry, scans)
     return results, jax.tree.map(lambda x: x[0], drives)
 
 
 # Compiled quickly, it would run a third slower, which pays only below some hundred drives of the
 # office; and chosen by the number of trials, a trial would depend on that number.
-_SPREAD_GROUPS = DeviceMap(_filter_group, size=1, static=6)
+_SPREAD_GROUPS = DeviceMap(_filter_group, size=1, static=7)
 
 
 def run_trials(
@@ -193,7 +199,7 @@ def run_trials(
     if devices is not None and not len(devices):
         raise ValueError("devices is empty; None stands for all")
     used = jax.devices() if devices is None else devices
-    groups = _run_groups(key, config, params, given, begin, total, used)
+    groups = _run_groups(key, config, params, given, begin, total, used, with_map=False)
     return (results for results, _ in groups)
 
 
@@ -230,7 +236,7 @@ def run_trials_and_map(
     params = as_params(params, match_scans=False)
     given = drive_of(key, config, robot, world, path, num_scans, life, False)
     total = as_count("num_trials", num_trials)
-    groups = _run_groups(key, config, params, given, 0, total, jax.devices())
+    groups = _run_groups(key, config, params, given, 0, total, jax.devices(), with_map=True)
     return ((results, drive) for results, drive in groups if drive is not None)
 
 
@@ -242,11 +248,14 @@ def _run_groups(
     first: int,
     num_trials: int,
     devices: Sequence[jax.Device],
+    *,
+    with_map: bool,
 ) -> Iterator[tuple[TrialResult, FilteredDrive | None]]:
     """The loop of `run_trials`, whose arguments are checked."""
     common = _Common(jax.random.key_data(key), params, given.world, given.path, given.life)
     key_type = jax.random.key_impl(key)
-    static = config.frontend, config.filter, given.robot, given.num_scans, key_type, given.matching
+    of_drive = given.robot, given.num_scans, key_type, given.matching
+    static = config.frontend, config.filter, *of_drive, with_map
     per_round = EPISODE_BATCH * len(devices)
 
     def begin(start: int) -> Callable[[], tuple[TrialResult, FilteredDrive | None]]:

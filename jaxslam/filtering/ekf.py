@@ -21,7 +21,7 @@ from jaxslam.filtering.joint_covariance import (
     LinearizedMeasurements,
     add_block_products,
 )
-from jaxslam.filtering.kalman import UpdateResult, kalman_update
+from jaxslam.filtering.kalman import Innovation, UpdateResult, kalman_update
 from jaxslam.filtering.measurement_model import measure, predict_measurement, residual
 
 LINEARISATIONS = ("standard", "first_estimates", "invariant")
@@ -198,13 +198,18 @@ def linearize(
 
 
 def update(
-    belief: Belief, rows: LinearizedMeasurements, *, linearisation: str = "standard"
+    belief: Belief,
+    rows: LinearizedMeasurements,
+    known: Innovation | None = None,
+    *,
+    linearisation: str = "standard",
 ) -> tuple[Belief, UpdateResult]:
     """Kalman update by all innovations of a scan at once.
 
     Args:
         belief: Predicted belief.
         rows: Linearised measurements, of `linearize`.
+        known: Products of the two that are known already.
         linearisation: One of `LINEARISATIONS`.
 
     Returns:
@@ -219,7 +224,7 @@ def update(
         3-D invariant-EKF SLAM".
     """
     check_linearisation(linearisation)
-    result = kalman_update(covariance_blocks(belief), rows)
+    result = kalman_update(covariance_blocks(belief), rows, known)
     shift, cov = result.shift, result.cov
     if linearisation == "invariant":
         shift, cov = _retract_invariant(shift, cov, belief.kind == WALL)

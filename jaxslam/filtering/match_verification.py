@@ -6,7 +6,7 @@ from jaxslam.core.features import Features
 from jaxslam.core.se2 import wrap_angle
 from jaxslam.core.types import JUNCTION, WALL, Array
 from jaxslam.filtering.belief import Belief
-from jaxslam.filtering.compatibility import jointly_compatible
+from jaxslam.filtering.compatibility import JointMatches, jointly_compatible
 from jaxslam.filtering.covariance import slot_blocks, slot_rows
 from jaxslam.filtering.data_association import (
     AssociationSpec,
@@ -22,7 +22,7 @@ def verify_matches(
     features: Features,
     linearized: LinearizedMeasurements,
     s: Array,
-) -> tuple[Array, Array]:
+) -> tuple[JointMatches, Array]:
     """Verify the matches of a scan before they update the state.
 
         consistent = matches that pass the joint compatibility test        (`jointly_compatible`)
@@ -47,30 +47,32 @@ def verify_matches(
         s: (2 M, 2 M) joint covariance of the innovations.
 
     Returns:
-        The accepted matches (M,) bool, and for each slot (L,) int32 the number of consecutive scans
-        in which it was matched and not yet accepted.
+        The accepted matches, their joint covariance factored; and for each slot (L,) int32 the
+        number of consecutive scans in which it was matched and not yet accepted.
     """
     matched = jnp.any(linearized.H_landmark != 0.0, axis=(1, 2))
     is_point = matched & (features.kind != WALL)
     degrees = jnp.where(matched, jnp.where(features.kind == WALL, 1, 2), 0).astype(jnp.int32)
-    consistent = jointly_compatible(s, linearized.residual, degrees)
-
     squared_range = jnp.sum(features.xy**2, axis=1)
     uncertain = is_point & (
         _position_variance(linearized, s, squared_range) > spec.verify_above_std**2
     )
     agrees = _distances_agree(spec, belief, features, linearized, squared_range)
-    supported = jnp.any(agrees & (is_point & consistent)[None], axis=1)
-    supported |= belief.num_pending[linearized.slot] + 1 >= spec.verify_scans
+    seen_before = belief.num_pending[linearized.slot] + 1 >= spec.verify_scans
 
-    accepted = consistent & (~uncertain | supported)
-    pending = is_point & consistent & ~accepted
+    def accept(consistent: Array) -> Array:
+        supported = jnp.any(agrees & (is_point & consistent)[None], axis=1) | seen_before
+        return ~uncertain | supported
+
+    verified = jointly_compatible(s, linearized.residual, degrees, review=accept)
+    accepted = verified.kept
+    pending = is_point & verified.passed & ~accepted
     size = belief.num_seen.size
     num_pending = belief.num_pending.at[jnp.where(accepted, linearized.slot, size)].set(
         0, mode="drop"
     )
     num_pending = num_pending.at[jnp.where(pending, linearized.slot, size)].add(1, mode="drop")
-    return accepted, num_pending
+    return verified, num_pending
 
 
 def _position_variance(rows: LinearizedMeasurements, s: Array, squared_range: Array) -> Array:

@@ -22,7 +22,7 @@ from jaxslam.filtering.config import (
 from jaxslam.filtering.data_association import Association, Matches, associate, use_known_ids
 from jaxslam.filtering.inputs import check_inputs
 from jaxslam.filtering.joint_covariance import LinearizedMeasurements, mask_measurements
-from jaxslam.filtering.kalman import UpdateResult, innovation_cov
+from jaxslam.filtering.kalman import Innovation, UpdateResult, project
 from jaxslam.filtering.match_verification import verify_matches
 from jaxslam.filtering.noise import NoiseParams, measurement_cov, motion_estimate
 from jaxslam.filtering.odometry_bias import correct_odometry, walk
@@ -94,11 +94,14 @@ def unchecked_step(
     found = _associate(config, predicted, features, features_cov, measurement.landmark_ids)
     matches = _choose(config, predicted, features, found.slot)
     chosen, rows = _linearise(config, predicted, features, features_cov, matches)
+    known = None
     if not is_known:
-        predicted, rows, matches = _verify(config, predicted, chosen, rows, matches)
+        predicted, rows, matches, known = _verify(config, predicted, chosen, rows, matches)
+    if params.student_dof is not None:
+        known = None  # the weights change R
     rows, score = _reweight(params, predicted, chosen, rows, matches)
     predicted = _adapt(config, belief, predicted, odometry_cov, chosen, rows, matches)
-    updated, result, matches = _update(config, predicted, rows, matches)
+    updated, result, matches = _update(config, predicted, rows, known, matches)
     tracked, pruned, merged = manage_tracks(config, updated, features, matches, is_known)
     found = found._replace(is_new=found.is_new & result.ok)
     mapped, new_slot, evicted = add_landmarks(config, tracked, features, features_cov, found)
@@ -215,20 +218,25 @@ def _verify(
     chosen: Features,
     rows: LinearizedMeasurements,
     matches: Matches,
-) -> tuple[Belief, LinearizedMeasurements, Matches]:
+) -> tuple[Belief, LinearizedMeasurements, Matches, Innovation]:
     """Drop the matches that `verify_matches` rejects.
 
     Returns:
         The belief with its counts of matches not yet accepted, the rows and the matches that are
-        left. A rejected match does not count as an observation of its landmark, either.
+        left, and what the test computed of their innovations. A rejected match does not count as
+        an observation of its landmark, either.
     """
-    joint_cov = lax.stop_gradient(innovation_cov(ekf.covariance_blocks(belief), rows))
-    accepted, num_pending = verify_matches(config.association, belief, chosen, rows, joint_cov)
+    products, joint_cov = lax.stop_gradient(project(ekf.covariance_blocks(belief), rows))
+    verified, num_pending = verify_matches(config.association, belief, chosen, rows, joint_cov)
+    accepted = verified.kept
+    left = jnp.repeat(accepted, 2)[:, None]
+    products = jax.tree.map(lambda x: jnp.where(left, x, 0.0), products)
+    known = Innovation(*products, *verified.factor)
     rows, belief = mask_measurements(rows, accepted), belief._replace(num_pending=num_pending)
     slot, used, order = matches
     rejected = used & jnp.zeros_like(used).at[order].set(~accepted)
     slot = jnp.where(rejected, belief.num_seen.size, slot)
-    return belief, rows, Matches(slot, used & ~rejected, order)
+    return belief, rows, Matches(slot, used & ~rejected, order), known
 
 
 def _reweight(
@@ -272,7 +280,11 @@ def _adapt(
 
 
 def _update(
-    config: FilterConfig, belief: Belief, rows: LinearizedMeasurements, matches: Matches
+    config: FilterConfig,
+    belief: Belief,
+    rows: LinearizedMeasurements,
+    known: Innovation | None,
+    matches: Matches,
 ) -> tuple[Belief, UpdateResult, Matches]:
     """Update by all rows at once, unless the result is not finite.
 
@@ -281,7 +293,7 @@ def _update(
         `result.ok` is False and no match is left. An update that fails changes no covariance, so
         only the mean is restored.
     """
-    updated, result = ekf.update(belief, rows, linearisation=config.linearisation)
+    updated, result = ekf.update(belief, rows, known, linearisation=config.linearisation)
     finite = jnp.all(jnp.isfinite(updated.mean)) & result.ok
     updated = updated._replace(mean=jnp.where(finite, updated.mean, belief.mean))
     slot = jnp.where(finite, matches.slot, belief.num_seen.size)

@@ -13,6 +13,8 @@ from jax.custom_batching import custom_vmap
 
 from jaxslam.core.types import Array
 
+MAX_ELIMINATED = 4  # rows of a matrix up to which it is eliminated row by row
+
 
 def add_outer_products(start: Array, left: Array, right: Array, *, sign: int = 1) -> Array:
     """`start` (a, b) plus or minus left^T right, for left (n, a) and right (n, b).
@@ -28,22 +30,14 @@ def add_outer_products(start: Array, left: Array, right: Array, *, sign: int = 1
 def inverse_cholesky(s: Array) -> tuple[Array, Array, Array]:
     """Inverse of the Cholesky factor of S, and log det S.
 
-    Forward elimination of the table [S | I]. With S = L L^T, the elimination multiplies the table
-    from the left by A = L^-1, so that its right half ends as A:
+    With S = L L^T, A = L^-1 is found by halves: of the blocks
 
-        [S | I]  ->  [L^T | A],      A S A^T = I,      log det S = sum_k log pivot_k
+        S = [S11   S21^T]     L21 = S21 A1^T,  A = [     A1       0 ]
+            [S21   S22  ]                      [-A2 L21 A1   A2]
 
-    Pseudo-code, one row at a time:
-
-        for k in 0..n-1:
-            pivot_k = table[k, k]                         # L[k, k]^2
-            row     = table[k] / sqrt(pivot_k)            # [row k of L^T | row k of A]
-            for i > k:  table[i] -= L[i, k] * row         # L[i, k] = row[i], as S is symmetric
-
-    The code keeps only what is left of the table: finished rows and columns are cut off, so column
-    0 is the next pivot's. It eliminates two rows at a time, which halves the passes over the table.
-    The loop is unrolled while tracing because the table shrinks: a `lax.scan` over rows of fixed
-    size takes five times as long.
+    where A1 is the inverse factor of S11, and A2 that of the matrix beside it. Matrices of up to
+    `MAX_ELIMINATED` rows are eliminated row by row. So the operations are few and small, all the
+    same for many matrices; row by row alone twice as many are run, and compiled.
 
     Args:
         s: (n, n) symmetric S.
@@ -52,31 +46,46 @@ def inverse_cholesky(s: Array) -> tuple[Array, Array, Array]:
         A (n, n), lower triangular; log det S (); and whether S is positive definite and finite
         () bool. Where it is not, A and the logarithm are zero.
     """
-    n = s.shape[0]
+    inv_root, diagonal = _inverse_factor(s)
+    good = jnp.all(diagonal > 0.0) & jnp.all(jnp.isfinite(diagonal))
+    logdet = 2 * jnp.sum(jnp.log(jnp.where(good, diagonal, 1.0)))
+    return jnp.where(good, inv_root, 0.0), logdet, good
+
+
+def _inverse_factor(s: Array) -> tuple[Array, Array]:
+    """A = L^-1 (n, n) and the diagonal (n,) of L, of which a number is not positive if S is not."""
+    n, half = len(s), len(s) // 2
+    if n <= MAX_ELIMINATED:
+        return _eliminated(s)
+    first, first_diagonal = _inverse_factor(s[:half, :half])
+    below = jnp.sum(s[half:, None, :half] * first[None], axis=2)  # L21
+    left = s[half:, half:] - jnp.sum(below[:, None] * below[None], axis=2)
+    second, second_diagonal = _inverse_factor(left)
+    corner = jnp.sum(below[:, :, None] * first[None], axis=1)
+    corner = -jnp.sum(second[:, :, None] * corner[None], axis=1)
+    upper = jnp.pad(first, ((0, 0), (0, n - half)))
+    lower = jnp.concatenate([corner, second], axis=1)
+    return jnp.concatenate([upper, lower]), jnp.concatenate([first_diagonal, second_diagonal])
+
+
+def _eliminated(s: Array) -> tuple[Array, Array]:
+    """`_inverse_factor` of a small S, by forward elimination of the table [S | I].
+
+    It multiplies the table from the left by A, so that [S | I] becomes [L^T | A]:
+
+        row k  =  table[k] - sum over j < k of L[k, j] (row j),     L[k, j] = (row j)[k]
+        row k  =  row k / sqrt((row k)[k])                          if that is positive
+    """
+    n = len(s)
     table = jnp.concatenate([s, jnp.eye(n, dtype=s.dtype)], axis=1)
-    rows, pivots = [], []
-    for k in range(0, n, 2):
-        width = n - k  # columns of S that are left of the table
-        first, pivot = _scaled_pivot_row(table[0], 0)
-        pivots.append(pivot)
-        rows.append(first[width:])
-        if k + 1 < n:
-            second, pivot = _scaled_pivot_row(table[1] - first[1] * first, 1)
-            pivots.append(pivot)
-            rows.append(second[width:])
-            # A pivot's column is its row read downwards: what is left of S stays symmetric.
-            table = table[2:, 2:] - first[2:width, None] * first[None, 2:]
-            table -= second[2:width, None] * second[None, 2:]
-    pivot = jnp.stack(pivots)
-    good = jnp.all(pivot > 0.0) & jnp.all(jnp.isfinite(pivot))
-    logdet = jnp.sum(jnp.log(jnp.where(good, pivot, 1.0)))
-    return jnp.where(good, jnp.stack(rows), 0.0), logdet, good
-
-
-def _scaled_pivot_row(row: Array, column: int) -> tuple[Array, Array]:
-    """Row divided by the square root of its pivot, row[column], and the pivot (); safe if <= 0."""
-    pivot = row[column]
-    return row * lax.rsqrt(jnp.where(pivot > 0.0, pivot, 1.0)), pivot
+    rows: list[Array] = []
+    for k in range(n):
+        row = table[k]
+        for finished in rows:
+            row = row - finished[k] * finished
+        rows.append(row * lax.rsqrt(jnp.where(row[k] > 0.0, row[k], 1.0)))
+    diagonal = jnp.stack([row[k] for k, row in enumerate(rows)])
+    return jnp.stack(rows)[:, n:], diagonal
 
 
 def whiten(s: Array, b: Array) -> Array:

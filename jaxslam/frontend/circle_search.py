@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.core.ranking import first_true, sorted_three, stable_order
 from jaxslam.core.types import Array
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
 from jaxslam.frontend.pyramid import Level
-from jaxslam.frontend.ranking import first_true, sorted_three, stable_order
 from jaxslam.frontend.tangent_circles import (
     TangentCircles,
     WallSegments,

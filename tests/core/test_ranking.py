@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam.core.ranking import first_true, sorted_three, stable_order
 from jaxslam.frontend.lidar import bearing
-from jaxslam.frontend.ranking import first_true, sorted_three, stable_order
 from jaxslam.frontend.trailing_batch import with_trailing_batch
 
 

@@ -168,8 +168,10 @@ def _fwd(
 
 
 def _bwd(saved: Saved, grad: UpdateResult) -> tuple[CovarianceBlocks, LinearizedMeasurements, None]:
-    of_results = {"cov": grad.cov, "shift": grad.shift, "nis": grad.nis, "logdet": grad.logdet}
-    return *grad_update(saved, **of_results), None
+    by_cov, by_rows = grad_update(
+        saved, cov=grad.cov, shift=grad.shift, nis=grad.nis, logdet=grad.logdet
+    )
+    return by_cov, by_rows, None
 
 
 _update.defvjp(_fwd, _bwd)

@@ -230,8 +230,9 @@ def _verify(
     verified, num_pending = verify_matches(config.association, belief, chosen, rows, joint_cov)
     accepted = verified.kept
     left = jnp.repeat(accepted, 2)[:, None]
-    products = jax.tree.map(lambda x: jnp.where(left, x, 0.0), products)
-    known = Innovation(*products, *verified.factor)
+    by_pose, by_map = (jnp.where(left, x, 0.0) for x in products)
+    inv_root, logdet, is_definite = verified.factor
+    known = Innovation(by_pose, by_map, inv_root, logdet, is_definite)
     rows, belief = mask_measurements(rows, accepted), belief._replace(num_pending=num_pending)
     slot, used, order = matches
     rejected = used & jnp.zeros_like(used).at[order].set(~accepted)

@@ -6,7 +6,7 @@ much as some hundred numbers: `operations` counts them, those of a loop as often
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import common
+from experiments.program_sizes import num_equations
 from experiments.timing import fastest
 from jaxslam.core.batching import map_batches
 from jaxslam.core.scan import Scan
@@ -149,20 +150,6 @@ def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def num_equations(jaxpr: Any) -> int:
-    """Number of equations of a jaxpr, with those of the ones inside."""
-    inner = (x for eqn in jaxpr.eqns for value in eqn.params.values() for x in _jaxprs(value))
-    return len(jaxpr.eqns) + sum(map(num_equations, inner))
-
-
-def _jaxprs(value: Any) -> Iterator[Any]:
-    """The jaxprs in a parameter of an equation."""
-    for x in value if isinstance(value, tuple | list) else (value,):
-        x = getattr(x, "jaxpr", x)
-        if hasattr(x, "eqns"):
-            yield x
 
 
 def executed_operations(text: str) -> int:

@@ -176,8 +176,9 @@ def run_trials(
 ) -> Iterator[TrialResult]:
     """Simulate and filter trials `first` to B - 1; yield results in order, some at a time.
 
-    A round gives each of D devices one group of `EPISODE_BATCH` trials. Round i + 1 is queued
-    before round i is waited for, so devices work while the caller has the results of round i:
+    A round gives each of D devices one group of trials, 4 on a CPU (`EPISODE_BATCH`). Round i + 1
+    is queued before round i is waited for, so devices work while the caller has the results of
+    round i:
 
         host      queue 0, 1 | wait 0 | yield 0 | queue 2 | wait 1 | yield 1 | wait 2 | yield 2
         devices     | round 0         | round 1           | round 2          |
@@ -269,12 +270,13 @@ def _run_groups(
     key_type = jax.random.key_impl(key)
     of_drive = given.robot, given.num_scans, key_type, given.matching
     static = config.frontend, config.filter, *of_drive, with_map
-    per_round = EPISODE_BATCH * len(devices)
+    group_size = EPISODE_BATCH.on(devices[0].platform)
+    per_round = group_size * len(devices)
 
     def begin(start: int) -> Callable[[], tuple[TrialResult, FilteredDrive | None]]:
         # The last round is filled up with its last trial, so that nothing is compiled again.
         numbers = np.minimum(start + np.arange(per_round, dtype=np.int32), num_trials - 1)
-        groups = numbers.reshape(-1, EPISODE_BATCH)
+        groups = numbers.reshape(-1, group_size)
         return _SPREAD_GROUPS.begin(*static, common, groups, devices=devices)
 
     def end(
@@ -286,8 +288,8 @@ def _run_groups(
         return results, jax.tree.map(lambda x: x[0].copy(), drives)
 
     pending = None
-    # Groups begin at multiples of EPISODE_BATCH, whatever `first` is.
-    for start in range(first - first % EPISODE_BATCH, num_trials, per_round):
+    # Groups begin at multiples of their size, whatever `first` is.
+    for start in range(first - first % group_size, num_trials, per_round):
         following = start, begin(start)
         if pending is not None:
             yield end(*pending)

@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
+from jaxslam.core.batching import BatchSize
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.types import Array, as_count
 from jaxslam.pipeline.config import Config
@@ -72,7 +73,9 @@ def value_and_gradient(
 
 
 @cache
-def _over_devices(function: Callable[..., Any], batch_size: int, quickly: bool) -> DeviceMap:
+def _over_devices(
+    function: Callable[..., Any], batch_size: int | BatchSize, quickly: bool
+) -> DeviceMap:
     """A function of one sequence over many; the same object for the same arguments."""
     return DeviceMap(function, size=batch_size, static=3, compile_quickly=quickly)
 

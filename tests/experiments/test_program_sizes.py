@@ -6,7 +6,7 @@ from jax import lax
 
 from experiments import program_sizes
 from experiments.program_sizes import difference, num_equations
-from experiments.programs import PROGRAMS
+from experiments.programs import PROGRAMS, traced
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
@@ -16,6 +16,13 @@ def test_programs_have_their_recorded_size(name, single_precision):
         pytest.skip(f"sizes are recorded with jax {recorded.jax}, and this is {jax.__version__}")
     wrong = difference(name, program_sizes.size(name), recorded.equations)
     assert wrong is None, wrong
+
+
+@pytest.mark.parametrize("name", [name for name in PROGRAMS if not name.startswith("trials")])
+def test_programs_lower_for_an_accelerator(name, single_precision):
+    """`test_accelerator` has those of trials."""
+    text = traced(name).lower(lowering_platforms=("cuda",)).as_text()
+    assert "stablehlo" in text and "callback" not in text
 
 
 def test_all_that_is_recorded_exists():

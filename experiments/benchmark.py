@@ -236,6 +236,7 @@ def main(argv: list[str] | None = None) -> None:
     numbers = compute(args.seed, args.runs, args.maps, args.drives, args.repeats)
     common.save(args.out, "benchmark", numbers, draw)
     of_chain, of_front = numbers["chain"], numbers["front_end"]
+    chain_profile.print_table(numbers["chain_profile"])
     print(f"{of_chain['scans_per_second']:.0f} scans per second on one core")
     print(percent(of_chain["share_of_chain"]))
     in_life = numbers["life"]

@@ -125,7 +125,9 @@ def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
     world, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
     keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    simulated = trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+    simulated = trial_episodes.simulate_drives(
+        keys, config.frontend, robot, world, path, num_scans=num_scans
+    )
     poses = simulated.truth.reshape(-1, 3)
     cast_rays = batched(partial(cast, config.frontend.lidar, world))
     run_filter = jax.jit(partial(episodes.filter_batch, config.filter, params))

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import chdtri
 
 from jaxslam.core.linalg import add_outer_products, inverse_cholesky
 from jaxslam.core.types import Array
@@ -77,6 +76,8 @@ def jointly_compatible(
         Neira, Tardos (2001), Data association in stochastic mapping using the joint
         compatibility test, with greedy removal in place of branch and bound.
     """
+    from scipy.special import chdtri  # imported here, because it is slow to import
+
     degrees = np.maximum(np.arange(2 * rank.size + 1), 1)
     bound = jnp.asarray(chdtri(degrees, 1 - probability), s.dtype)
     root = inverse_cholesky(s)[0]

@@ -216,7 +216,7 @@ PROGRAMS: dict[str, Callable[[], Program]] = {
 
 
 def traced(name: str) -> jax.stages.Traced:
-    """A main program, traced in JAX's default precision; once for all who ask."""
+    """A main program, traced for a CPU in JAX's default precision; once for all who ask."""
     return _traced(name, jax.dtypes.canonicalize_dtype(float))
 
 
@@ -224,4 +224,5 @@ def traced(name: str) -> jax.stages.Traced:
 def _traced(name: str, precision: Any) -> jax.stages.Traced:
     del precision  # of the arguments that are made
     program = PROGRAMS[name]()
-    return jax.jit(program.function).trace(*program.arguments)
+    with jax.default_device("cpu"):
+        return jax.jit(program.function).trace(*program.arguments)

@@ -20,6 +20,7 @@ from experiments import (
     chain_profile,
     common,
     filter_benchmark,
+    import_time,
     life_benchmark,
     peer_automata,
     peer_filters,
@@ -175,6 +176,7 @@ def compute(seed: int, num_trials: int, maps: int, drives: int, repeats: int) ->
     return {
         "seed": seed,
         "cores": 1,
+        "import_vs_jax": import_time.import_vs_jax(),
         "chain": of_chain,
         "chain_profile": chain_profile.compute(seed, num_trials, repeats),
         "life": life_benchmark.compute(seed, num_trials, repeats),
@@ -236,6 +238,7 @@ def main(argv: list[str] | None = None) -> None:
     numbers = compute(args.seed, args.runs, args.maps, args.drives, args.repeats)
     common.save(args.out, "benchmark", numbers, draw)
     of_chain, of_front = numbers["chain"], numbers["front_end"]
+    chain_profile.print_table(numbers["chain_profile"])
     print(f"{of_chain['scans_per_second']:.0f} scans per second on one core")
     print(percent(of_chain["share_of_chain"]))
     in_life = numbers["life"]
@@ -251,6 +254,8 @@ def main(argv: list[str] | None = None) -> None:
     ratio = {name: x for name, x in of_front.items() if name.startswith("automaton")}
     ratio |= {name: numbers["estimator"][name] for name in ("filter_vs_c", "gradient_vs_filter")}
     print({name: x if x is None else round(x, 2) for name, x in ratio.items()})
+    imports = {code: round(x, 2) for code, x in numbers["import_vs_jax"].items()}
+    print(f"processor time of imports, by that of `{import_time.JAX}`: {imports}")
 
 
 if __name__ == "__main__":

@@ -2,11 +2,11 @@
 
 A part is timed alone, on what the parts before it found, so that the sum of the parts is a little
 above the whole. On a CPU each operation of a compiled program is dispatched, which costs about as
-much as some hundred numbers: `operations` counts them, those of a loop as often as it turns.
+much as some hundred numbers: `operations` counts them, those of a loop as often as it turns. On a
+device with thousands of lanes their longest chain matters, the `depth`.
 """
 
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import common
+from experiments import common, program_depth
+from experiments.program_sizes import num_equations
 from experiments.timing import fastest
 from jaxslam.core.batching import map_batches
 from jaxslam.core.scan import Scan
@@ -30,11 +31,6 @@ from jaxslam.pipeline import episodes
 from jaxslam.pipeline.config import Config
 from jaxslam.simulation import trial_episodes
 from jaxslam.simulation.ray_casting import cast
-
-COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.\-]+) .*\{\s*$")
-CALL = re.compile(r"(?:body|to_apply|branch_computations)=\{?((?:%[\w.\-]+(?:, )?)+)")
-TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
-NO_WORK = re.compile(r" (?:parameter|constant|tuple|get-tuple-element|bitcast)\(")
 
 
 def batched(function: Callable) -> Callable:
@@ -115,7 +111,10 @@ def frontend(config: Config, scans: Scan) -> dict[str, tuple[Any, ...]]:
 
 
 def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
-    """Rows of the profile: `part`, `us_per_scan`, `equations`, `operations` a scan.
+    """Rows of the profile: time, size and cost of each part.
+
+    They hold `part`, `us_per_scan`, `equations`, `unknown_loops`, and of `program_depth`, a scan,
+    `operations`, `depth`, `flops` and `bytes`. The scans of a batch share its depth.
 
     Args:
         seed: Of the trials.
@@ -126,7 +125,9 @@ def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
     world, robot, path, num_scans = common.drive_in()
     params = NoiseParams.for_simulated_robot(*robot[:2])
     keys = trial_episodes.trial_keys(jax.random.key(seed), np.arange(num_trials))
-    simulated = trial_episodes.simulate_keys(keys, config, robot, world, path, num_scans=num_scans)
+    simulated = trial_episodes.simulate_drives(
+        keys, config.frontend, robot, world, path, num_scans=num_scans
+    )
     poses = simulated.truth.reshape(-1, 3)
     cast_rays = batched(partial(cast, config.frontend.lidar, world))
     run_filter = jax.jit(partial(episodes.filter_batch, config.filter, params))
@@ -139,57 +140,25 @@ def compute(seed: int, num_trials: int, repeats: int) -> list[dict[str, Any]]:
     rows = []
     for part, (function, *given) in calls.items():
         traced = function.trace(*given)
-        executed = executed_operations(traced.lower().compile().as_text())
+        found = program_depth.profile(traced.lower().compile())
+        unknown = found.pop("unknown_loops")
         rows.append(
             {
                 "part": part,
                 "us_per_scan": 1e6 * taken[part] / count,
                 "equations": num_equations(traced.jaxpr.jaxpr),
-                "operations": executed / count,
+                "unknown_loops": unknown,
+                **{key: number and number / count for key, number in found.items()},
             }
         )
     return rows
 
 
-def num_equations(jaxpr: Any) -> int:
-    """Number of equations of a jaxpr, with those of the ones inside."""
-    inner = (x for eqn in jaxpr.eqns for value in eqn.params.values() for x in _jaxprs(value))
-    return len(jaxpr.eqns) + sum(map(num_equations, inner))
-
-
-def _jaxprs(value: Any) -> Iterator[Any]:
-    """The jaxprs in a parameter of an equation."""
-    for x in value if isinstance(value, tuple | list) else (value,):
-        x = getattr(x, "jaxpr", x)
-        if hasattr(x, "eqns"):
-            yield x
-
-
-def executed_operations(text: str) -> int:
-    """Operations that a compiled program dispatches, one for a loop whose length is not known.
-
-    Args:
-        text: Optimised HLO, as of `Compiled.as_text`.
-    """
-    bodies: dict[str, list[str]] = {}
-    name, entry = "", ""
-    for line in text.splitlines():
-        begins = COMPUTATION.match(line)
-        if begins and " = " not in line.split("{")[0]:
-            name = begins[1]
-            bodies[name] = []
-            entry = name if line.startswith("ENTRY") else entry
-        elif " = " in line and name:
-            bodies[name].append(line)
-
-    def count(name: str) -> int:
-        total = 0
-        for line in bodies.get(name, ()):
-            total += not NO_WORK.search(line)
-            if " while(" in line or " conditional(" in line or " call(" in line:
-                trips = TRIPS.search(line)
-                inner = [x.strip(" %") for found in CALL.findall(line) for x in found.split(",")]
-                total += (int(trips[1]) if trips else 1) * sum(map(count, inner))
-        return total
-
-    return count(entry)
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Print the rows of the profile."""
+    keys = list(rows[0])[1:]
+    print(f"{'a scan':26}" + "".join(f"{key.replace('_', ' '):>15}" for key in keys))
+    for row in rows:
+        numbers = (row[key] for key in keys)
+        shown = ("-" if x is None else f"{x:,.0f}" if x >= 100 else f"{x:.3g}" for x in numbers)
+        print(f"{row['part']:26}" + "".join(f"{text:>15}" for text in shown))

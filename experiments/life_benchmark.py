@@ -83,7 +83,7 @@ def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
         },
         repeats=repeats,
     )
-    few = poses["building"][: 4 * SCAN_BATCH]
+    few = poses["building"][: 4 * SCAN_BATCH.cpu]
     brute_force = fastest({"rays": ray_casting(plain, few)}, repeats=repeats)["rays"] / len(few)
     count = len(poses["office"])
     us = {name: 1e6 * taken[name] / count for name in ("rays_office", "rays")}

@@ -136,7 +136,7 @@ def _share(
 def _print_costs(variants: Sequence[Variant], seed: int, scans: int) -> None:
     """Time and memory of a study, measured on a few trials of its first variant."""
     first, before = variants[0], memory_now()
-    count = EPISODE_BATCH * jax.device_count()
+    count = EPISODE_BATCH.on(jax.default_backend()) * jax.device_count()
     begin = perf_counter()
     (probe,) = runner.run_timed([first], num_trials=count, seed=seed)
     # The first trials are computed twice, once to compile.

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,45 @@ import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from jaxslam.core.trace_cache import setting
 from jaxslam.core.types import Array
+
+
+class BatchSize(NamedTuple):
+    """Items that are vectorised at a time, by what they run on.
+
+    On a CPU there are few: their arrays stay in its cache, and more of them are not faster. An
+    accelerator begins an operation in some microseconds, however few numbers it is of, so that
+    there are as many as keep it busy; they cost memory, and where there are fewer items than a
+    batch holds, work on copies.
+
+    Attributes:
+        cpu: On a CPU.
+        accelerator: On all else.
+    """
+
+    cpu: int
+    accelerator: int
+
+    def on(self, platform: str) -> int:
+        """The number on a platform, as `Device.platform` and `traced_platform` name it."""
+        return self.cpu if platform == "cpu" else self.accelerator
+
+
+def traced_platform() -> str:
+    """Platform that programs are traced for: of `jax.default_device`, else of the default backend.
+
+    JAX traces a function again where its default device is another one. So a host without an
+    accelerator lowers programs for one by
+
+        with jax.default_device("gpu"):
+            traced = jax.jit(function).trace(*arguments)
+        traced.lower(lowering_platforms=("cuda",))
+    """
+    chosen = setting("jax_default_device")
+    if chosen is None:
+        return jax.default_backend()
+    return chosen if isinstance(chosen, str) else chosen.platform
 
 
 def sequential_vmap_on_cpu(function: Callable) -> Callable:
@@ -107,7 +145,7 @@ def update_where(wanted: Array, update: Callable, state: Any, *given: Any, block
     return branch(wanted, (state, given))
 
 
-def map_batches(function: Callable, items: Any, *, batch_size: int) -> Any:
+def map_batches(function: Callable, items: Any, *, batch_size: int | BatchSize) -> Any:
     """Map `function` over the leading axis of `items`, `batch_size` of them vectorised at a time.
 
     The last batch is filled up with copies of the last item: unlike `lax.map(batch_size=...)`
@@ -116,7 +154,7 @@ def map_batches(function: Callable, items: Any, *, batch_size: int) -> Any:
     Args:
         function: Of one item, an array or a record of arrays.
         items: Arrays of NumPy or JAX that lead with the number of items, at least one.
-        batch_size: Items of a batch.
+        batch_size: Items of a batch; of a `BatchSize` those on `traced_platform`.
 
     Returns:
         The results, arrays that lead with the number of items.
@@ -125,6 +163,8 @@ def map_batches(function: Callable, items: Any, *, batch_size: int) -> Any:
         ValueError: There are no items, their arrays differ in length, or `batch_size` is below 1.
     """
     count = leading_size("items", items)
+    if isinstance(batch_size, BatchSize):
+        batch_size = batch_size.on(traced_platform())
     if batch_size < 1:
         raise ValueError(f"batch_size is {batch_size}, not 1 or more")
     batch_size = min(batch_size, count)

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import cache, lru_cache, partial, wraps
 from typing import Any
 
@@ -12,7 +13,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import leading_size, pad_to
+from jaxslam.core.batching import BatchSize, leading_size, pad_to, traced_platform
 from jaxslam.core.types import Array
 
 XLA_FLAGS = {
@@ -104,20 +105,26 @@ class DeviceMap:
     """
 
     def __init__(
-        self, function: Callable, *, size: int, static: int = 0, compile_quickly: bool = False
+        self,
+        function: Callable,
+        *,
+        size: int | BatchSize,
+        static: int = 0,
+        compile_quickly: bool = False,
     ):
         """Wrap a function of one item.
 
         Args:
             function: Of `static` hashable arguments, one record common to all items, and one item.
-            size: Items of a batch; a single one is not vectorised.
+            size: Items of a batch, of a `BatchSize` those of the devices; a single one is not
+                vectorised.
             static: Number of leading arguments that are static under jit.
             compile_quickly: Compile with `quick_options`, for large programs of small operations.
 
         Raises:
             ValueError: `size` is below 1, or `static` below 0.
         """
-        if size < 1:
+        if min(size if isinstance(size, BatchSize) else (size,)) < 1:
             raise ValueError(f"size is {size}, not 1 or more")
         if static < 0:
             raise ValueError(f"static is {static}, not 0 or more")
@@ -155,7 +162,10 @@ class DeviceMap:
         static, (common, items) = args[: self._static], args[self._static :]
         count = leading_size("items", items)
         mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("items",))
-        size = min(self.size, -(-count // mesh.size))
+        most = self.size
+        if isinstance(most, BatchSize):
+            most = most.on(mesh.devices[0].platform)
+        size = min(most, -(-count // mesh.size))
         rounds = -(-count // (size * mesh.size))
         items = pad_to(items, to=mesh.size * rounds * size)
 
@@ -277,10 +287,14 @@ def _compile(
     Tracing and lowering do, and come first. The programs stay in JAX's cache, where the next call
     finds them.
     """
-    lowered = [
-        run.lower(program=program, common=common, items=batch)
-        for common, batch in zip(common_of, batch_of, strict=True)
-    ]
+
+    def lower(common: Any, batch: Any) -> Callable[[], Callable[..., Any]]:
+        device = jax.tree.leaves(batch)[0].device
+        other = device.platform != traced_platform()  # batches of another size
+        with jax.default_device(device) if other else nullcontext():
+            return run.lower(program=program, common=common, items=batch)
+
+    lowered = list(map(lower, common_of, batch_of))
     with ThreadPoolExecutor(min(len(lowered), num_cores())) as pool:
         return list(pool.map(lambda each: each(), lowered))
 

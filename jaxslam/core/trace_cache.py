@@ -32,8 +32,8 @@ A file is
                  arguments and the results
 
 A damaged file fails its checksum and is written again. A file that cannot be written is skipped:
-the process then uses what it has traced. Files are never removed; a change of the package's
-sources gives all of them new names.
+the process then uses what it has traced. A change of the package's sources gives all of them new
+names; `cache_limit` removes files that have not been used for long.
 
 Why arguments are committed to a device: JAX compiles a program once for committed arrays (bound to
 a device by `jax.device_put`) and once more for uncommitted ones (all others). Results of an
@@ -57,6 +57,8 @@ from typing import Any, NamedTuple
 import jax
 from jax import export
 from jax.sharding import SingleDeviceSharding
+
+from jaxslam.core.cache_limit import UNFINISHED, mark_used
 
 PACKAGE = __name__.split(".")[0]
 HOME = Path(__file__).parents[1]
@@ -297,6 +299,7 @@ def _read(path: Path) -> export.Exported | None:
         data = path.read_bytes()
     except OSError:
         return None
+    mark_used(path)
     digest, serialised = data[:DIGEST], data[DIGEST:]
     intact = hashlib.sha256(serialised).digest() == digest
     return export.deserialize(bytearray(serialised)) if intact else None
@@ -309,7 +312,7 @@ def _write(path: Path, exported: export.Exported) -> None:
     """
     serialised = bytes(exported.serialize())
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=path.parent, prefix=".unfinished-") as folder:
+    with TemporaryDirectory(dir=path.parent, prefix=UNFINISHED) as folder:
         temporary = Path(folder) / path.name
         temporary.write_bytes(hashlib.sha256(serialised).digest() + serialised)
         temporary.replace(path)

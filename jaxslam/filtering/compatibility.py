@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from scipy.special import chdtri
 
 from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.core.types import Array
@@ -103,6 +102,8 @@ def jointly_compatible(
         Neira, Tardos (2001), Data association in stochastic mapping using the joint
         compatibility test, with greedy removal in place of branch and bound.
     """
+    from scipy.special import chdtri  # imported here, because it is slow to import
+
     s, residual = lax.stop_gradient((s, residual))
     degrees = np.maximum(np.arange(2 * rank.size + 1), 1)
     bound = jnp.asarray(chdtri(degrees, 1 - probability), s.dtype)

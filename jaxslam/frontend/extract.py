@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import map_batches
+from jaxslam.core.batching import BatchSize, map_batches
 from jaxslam.core.features import Features, concatenate_features
 from jaxslam.core.scan import Lidar, Scan, as_scan
 from jaxslam.core.types import Array
@@ -24,7 +24,7 @@ from jaxslam.frontend.local_pyramid import find_pyramid_arcs
 from jaxslam.frontend.pyramid import Level, beyond_finer
 from jaxslam.frontend.segments import POINTS_PER_GAP, Segments, segment_bits, segment_cells
 
-SCAN_BATCH = 32  # scans whose features are extracted together
+SCAN_BATCH = BatchSize(cpu=32, accelerator=1024)  # scans whose features are extracted together
 
 
 def extract_features(config: FrontendConfig, scan: Scan) -> Features:

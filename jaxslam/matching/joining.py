@@ -18,7 +18,7 @@ hardly contradicts itself. One place alone never joins two maps.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from jaxslam.core.se2_np import compose, transform, wrap_angle
 from jaxslam.matching.map_places import (
@@ -174,7 +174,7 @@ def compare_maps(first: PosedScans, second: PosedScans, between: np.ndarray) -> 
 
 def _nearest_scans(poses: np.ndarray, of: np.ndarray) -> list[tuple[int, int]]:
     """For each of the poses `of` (N, 3) the `VIEWS` of poses (K, 3) that are most like it, near."""
-    near = cKDTree(poses[:, :2]).query_ball_point(of[:, :2], VIEW_RADIUS)
+    near = scipy.spatial.cKDTree(poses[:, :2]).query_ball_point(of[:, :2], VIEW_RADIUS)
     pairs = []
     for scan, others in enumerate(near):
         index = np.array(others, int)

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist, pdist
+import scipy
 
 from jaxslam.core import trace_cache
 from jaxslam.core.batching import on_device
@@ -205,7 +204,8 @@ def consistent_sets(spec: JoinSpec, found: FoundPlaces) -> list[np.ndarray]:
         return []
     expected = compose(transforms[:, None], found.second[None])  # (i, j): place j by transform i
     off = relative(expected, found.first[None])
-    limit = DRIFT[0] + DRIFT[1] * cdist(found.second[:, :2], found.second[:, :2])
+    apart = scipy.spatial.distance.cdist(found.second[:, :2], found.second[:, :2])
+    limit = DRIFT[0] + DRIFT[1] * apart
     agrees = (np.hypot(off[..., 0], off[..., 1]) < limit) & (np.abs(off[..., 2]) < MAX_TURN)
     by_query = np.zeros((len(transforms), found.query.max() + 1))
     for k, query in enumerate(found.query.tolist()):  # each query counts once
@@ -244,7 +244,7 @@ def fit_transform(own: np.ndarray, other: np.ndarray, weight: np.ndarray) -> np.
 
 def span_of(poses: np.ndarray) -> float:
     """[m] largest distance between two of poses (N, 3); zero without two."""
-    return float(pdist(poses[:, :2]).max(initial=0.0))
+    return float(scipy.spatial.distance.pdist(poses[:, :2]).max(initial=0.0))
 
 
 def transforms_near(found: FoundPlaces, poses: np.ndarray) -> np.ndarray:
@@ -253,7 +253,7 @@ def transforms_near(found: FoundPlaces, poses: np.ndarray) -> np.ndarray:
     Each is that of the places near the one that is nearest: where maps have drifted, one transform
     does not hold all over.
     """
-    near = cdist(found.second[:, :2], found.second[:, :2]) < NEAR
+    near = scipy.spatial.distance.cdist(found.second[:, :2], found.second[:, :2]) < NEAR
     own = [fit_transform(found.second[k], found.first[k], found.weight[k]) for k in near]
-    nearest = cKDTree(found.second[:, :2]).query(poses[:, :2])[1]
+    nearest = scipy.spatial.cKDTree(found.second[:, :2]).query(poses[:, :2])[1]
     return np.stack(own)[nearest]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from jaxslam.core.batching import pad_to
 from jaxslam.core.scan import Lidar, Scan, check_lidar
@@ -192,7 +192,7 @@ def _nearest_surfaces(
     empty = point_at < 0
     if empty.all():
         return np.full(size, np.inf), np.zeros((*size, 2)), np.zeros(size)
-    distance, index = ndimage.distance_transform_edt(
+    distance, index = scipy.ndimage.distance_transform_edt(
         empty, sampling=spec.cell, return_distances=True, return_indices=True
     )
     nearest = point_at[tuple(index)]

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple, Self
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2_np import inverse_transform, transform
@@ -138,7 +138,8 @@ class ScanComparison:
         """
         self._posed = posed
         scan, beam = np.nonzero(np.isfinite(posed.ranges))
-        self._tree = cKDTree(np.column_stack([posed.ends[scan, beam], SEPARATION * scan]))
+        separated = np.column_stack([posed.ends[scan, beam], SEPARATION * scan])
+        self._tree = scipy.spatial.cKDTree(separated)
 
     def compare(self, first: np.ndarray, second: np.ndarray) -> Agreement:
         """Compare scans `first` (P,) with scans `second` (P,), indices into the posed scans."""

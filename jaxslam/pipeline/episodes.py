@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import se2_np
-from jaxslam.core.batching import map_batches
+from jaxslam.core.batching import BatchSize, map_batches
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.features import Features
@@ -34,7 +34,7 @@ from jaxslam.pipeline.stacking import as_episodes, numpy_episode
 from jaxslam.pipeline.stacking import stack_episodes as stack_episodes
 from jaxslam.pipeline.stacking import to_numpy_precision as to_numpy_precision
 
-EPISODE_BATCH = 4  # trials that a device filters together
+EPISODE_BATCH = BatchSize(cpu=4, accelerator=256)  # trials that a device filters together
 MIN_MAX_LANDMARKS = 384, 1024  # capacity for landmarks with a laser scanner: least and most
 METRES_PER_LANDMARK = 2.5  # [m] driven per landmark, for the capacity in between
 # Standard deviation of the range of a landmark measurement, as a fraction of the range, in the

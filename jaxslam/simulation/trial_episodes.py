@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.core.batching import map_batches
+from jaxslam.core.batching import BatchSize, map_batches, traced_platform
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
 from jaxslam.core.scan import Scan
 from jaxslam.core.types import Array, Key, as_count, as_size, check_type
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
+from jaxslam.frontend.extract import SCAN_BATCH
 from jaxslam.matching import scan_matching
 from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.pipeline.arguments import check_config
@@ -27,6 +28,11 @@ from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.worlds import World
 
 ROBOT = Robot()  # the default one
+
+DRIVE_BATCH = BatchSize(cpu=1, accelerator=256)  # drives that are simulated together
+DRIVE_SCAN_BATCH = BatchSize(
+    *(max(1, scans // drives) for scans, drives in zip(SCAN_BATCH, DRIVE_BATCH, strict=True))
+)  # scans of each of them
 
 
 class TrialDrive(NamedTuple):
@@ -141,7 +147,15 @@ def drives_and_scans(
         matching=matching,
         with_scans=with_scans,
     )
-    return lax.map(lambda key: one(key, config, robot, world, path), keys)
+    return map_drives(lambda key: one(key, config, robot, world, path), keys)
+
+
+def map_drives(simulate: Callable, items: Any) -> Any:
+    """`simulate` of each of `items` [B]: one after the other on a CPU, else some at a time."""
+    together = DRIVE_BATCH.on(traced_platform())
+    if together == 1:
+        return lax.map(simulate, items)
+    return map_batches(simulate, items, batch_size=together)
 
 
 def simulate_episode(
@@ -198,7 +212,7 @@ def episode_of(
         scan = item[1] if matching else scan_of(item)
         return extract.extract_features(config, scan), scan if with_scans else None
 
-    features, scans = map_batches(observe, items, batch_size=extract.SCAN_BATCH)
+    features, scans = map_batches(observe, items, batch_size=DRIVE_SCAN_BATCH)
     episode = Episode(truth=items[0], odometry=odometry, features=features, scan_matches=matches)
     return episode, scans
 

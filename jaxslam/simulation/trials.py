@@ -88,7 +88,7 @@ def replay_trial(
     return truth, result
 
 
-class _Common(NamedTuple):
+class TrialsCommon(NamedTuple):
     """What all trials of an experiment have in common.
 
     Attributes:
@@ -106,7 +106,7 @@ class _Common(NamedTuple):
     life: Life | None
 
 
-def _filter_group(
+def filter_group(
     frontend: FrontendConfig,
     config: FilterConfig,
     robot: Robot,
@@ -114,10 +114,23 @@ def _filter_group(
     key_type: Any,
     matching: ScanMatchSpec | None,
     with_map: bool,
-    common: _Common,
+    common: TrialsCommon,
     numbers: Array,
 ) -> tuple[TrialResult, FilteredDrive | None]:
-    """Simulate the trials with the numbers (EPISODE_BATCH,) in turn, and filter them together.
+    """Simulate the trials with the numbers (B,) in turn, and filter them together; not jitted.
+
+    It is the program of `run_trials`, a device and round.
+
+    Args:
+        frontend: Of the front end.
+        config: Of the filter.
+        robot: The robot, with its encoder noise.
+        num_scans: T, scans of a trial.
+        key_type: Implementation of the experiment's key, as of `jax.random.key_impl`.
+        matching: Options by which scans are matched; None: they are not.
+        with_map: Whether what the map of the first one is made of is wanted.
+        common: What all trials have in common.
+        numbers: (B,) int32 of the trials.
 
     Returns:
         The results, and what the first one's map is made of; None without `with_map`.
@@ -143,7 +156,7 @@ def _filter_group(
 
 # Compiled quickly, it would run a third slower, which pays only below some hundred drives of the
 # office; and chosen by the number of trials, a trial would depend on that number.
-_SPREAD_GROUPS = DeviceMap(_filter_group, size=1, static=7)
+_SPREAD_GROUPS = DeviceMap(filter_group, size=1, static=7)
 
 
 def run_trials(
@@ -163,8 +176,9 @@ def run_trials(
 ) -> Iterator[TrialResult]:
     """Simulate and filter trials `first` to B - 1; yield results in order, some at a time.
 
-    A round gives each of D devices one group of `EPISODE_BATCH` trials. Round i + 1 is queued
-    before round i is waited for, so devices work while the caller has the results of round i:
+    A round gives each of D devices one group of trials, 4 on a CPU (`EPISODE_BATCH`). Round i + 1
+    is queued before round i is waited for, so devices work while the caller has the results of
+    round i:
 
         host      queue 0, 1 | wait 0 | yield 0 | queue 2 | wait 1 | yield 1 | wait 2 | yield 2
         devices     | round 0         | round 1           | round 2          |
@@ -252,16 +266,17 @@ def _run_groups(
     with_map: bool,
 ) -> Iterator[tuple[TrialResult, FilteredDrive | None]]:
     """The loop of `run_trials`, whose arguments are checked."""
-    common = _Common(jax.random.key_data(key), params, given.world, given.path, given.life)
+    common = TrialsCommon(jax.random.key_data(key), params, given.world, given.path, given.life)
     key_type = jax.random.key_impl(key)
     of_drive = given.robot, given.num_scans, key_type, given.matching
     static = config.frontend, config.filter, *of_drive, with_map
-    per_round = EPISODE_BATCH * len(devices)
+    group_size = EPISODE_BATCH.on(devices[0].platform)
+    per_round = group_size * len(devices)
 
     def begin(start: int) -> Callable[[], tuple[TrialResult, FilteredDrive | None]]:
         # The last round is filled up with its last trial, so that nothing is compiled again.
         numbers = np.minimum(start + np.arange(per_round, dtype=np.int32), num_trials - 1)
-        groups = numbers.reshape(-1, EPISODE_BATCH)
+        groups = numbers.reshape(-1, group_size)
         return _SPREAD_GROUPS.begin(*static, common, groups, devices=devices)
 
     def end(
@@ -273,8 +288,8 @@ def _run_groups(
         return results, jax.tree.map(lambda x: x[0].copy(), drives)
 
     pending = None
-    # Groups begin at multiples of EPISODE_BATCH, whatever `first` is.
-    for start in range(first - first % EPISODE_BATCH, num_trials, per_round):
+    # Groups begin at multiples of their size, whatever `first` is.
+    for start in range(first - first % group_size, num_trials, per_round):
         following = start, begin(start)
         if pending is not None:
             yield end(*pending)

@@ -72,7 +72,8 @@ def collect(
     if callback is not None:
         callback(min(first, num_trials))
     if warm_up and first < num_trials:
-        next(results(min(first + EPISODE_BATCH * jax.device_count(), num_trials), first))
+        count = EPISODE_BATCH.on(jax.default_backend()) * jax.device_count()
+        next(results(min(first + count, num_trials), first))
         release_memory()
     begin = perf_counter()
     new: list[Record] = []

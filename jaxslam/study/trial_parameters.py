@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode
@@ -30,6 +29,7 @@ from jaxslam.simulation.life import Life
 from jaxslam.simulation.range_errors import RangeErrors
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.traffic import Traffic
+from jaxslam.simulation.trial_episodes import map_drives
 from jaxslam.simulation.trial_noise import TrialNoise, draws_of, simulate_from_noise
 from jaxslam.simulation.wheel_faults import WheelFaults
 from jaxslam.study.runner import Variant
@@ -203,7 +203,7 @@ def _errors(
         return episode._replace(features=restrict(episode.features, kept))
 
     params = _change(names, changes, common, with_keys(_first(data), key_type)).params
-    result = filter_batch(config, params, lax.map(simulate, data))
+    result = filter_batch(config, params, map_drives(simulate, data))
     return jnp.where(result.finite, jax.vmap(log_rmse)(result), jnp.nan)
 
 
@@ -241,7 +241,7 @@ def _gradients(
         return jnp.where(result.finite, log_rmse(result), jnp.nan)
 
     one_gradient = partial(jax.grad(error), changes)
-    return jax.vmap(one_gradient)(data, lax.map(simulate, data))
+    return jax.vmap(one_gradient)(data, map_drives(simulate, data))
 
 
 def keeps(period: Array, num_scans: int) -> Array:

@@ -17,7 +17,7 @@ from jaxslam.matching.icp import ScanMatchSpec
 from jaxslam.pipeline.episodes import EPISODE_BATCH, TrialResult, filter_batch
 from jaxslam.simulation.life import Life
 from jaxslam.simulation.robot import Robot
-from jaxslam.simulation.trial_episodes import trial_keys
+from jaxslam.simulation.trial_episodes import map_drives, trial_keys
 from jaxslam.simulation.trial_noise import TrialNoise, draw_noises, simulate_from_noise
 from jaxslam.simulation.worlds import World
 from jaxslam.study.runner import Variant
@@ -109,8 +109,9 @@ class TrialsFromNoise:
         data = noise._replace(
             start=jax.random.key_data(noise.start), scans=jax.random.key_data(noise.scans)
         )
-        data = pad_to(data, to=count + -count % EPISODE_BATCH)
-        groups = jax.tree.map(lambda x: x.reshape(-1, EPISODE_BATCH, *x.shape[1:]), data)
+        size = EPISODE_BATCH.on(jax.default_backend())
+        data = pad_to(data, to=count + -count % size)
+        groups = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), data)
         own = self._variant
         fixed = own.config.frontend, own.config.filter, own.robot, static
         common = (self._common, *given) if given else self._common
@@ -140,7 +141,7 @@ def _filter(
         noise = with_keys(one, key_type)
         return simulate_from_noise(noise, *given, life=common.life, matching=static[1])
 
-    return filter_batch(config, common.params, jax.lax.map(simulate, data))
+    return filter_batch(config, common.params, map_drives(simulate, data))
 
 
 def _scores(

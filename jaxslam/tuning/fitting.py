@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
+from jaxslam.core.batching import BatchSize
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.types import Array, as_count
 from jaxslam.pipeline.config import Config
@@ -54,17 +55,27 @@ def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequenc
     return call_loss(loss, info, sequence)
 
 
-def _value_and_gradient(
+def value_and_gradient(
     model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any
 ) -> tuple[Array, Array]:
-    """Loss () of one sequence and its gradient (P,) in the unconstrained numbers."""
+    """Loss () of one sequence and its gradient (P,) in the unconstrained numbers; not jitted.
+
+    Args:
+        model: The model.
+        loss: The loss.
+        transforms: Of each leaf of the parameters.
+        theta: The unconstrained numbers, as of `parameters.theta_tree`.
+        sequence: One sequence.
+    """
     differentiated = jax.value_and_grad(_value, argnums=3)
     value, gradient = differentiated(model, loss, transforms, theta, sequence)
     return value, ravel_pytree(gradient)[0]
 
 
 @cache
-def _over_devices(function: Callable[..., Any], batch_size: int, quickly: bool) -> DeviceMap:
+def _over_devices(
+    function: Callable[..., Any], batch_size: int | BatchSize, quickly: bool
+) -> DeviceMap:
     """A function of one sequence over many; the same object for the same arguments."""
     return DeviceMap(function, size=batch_size, static=3, compile_quickly=quickly)
 
@@ -76,7 +87,7 @@ def _is_short(data: Any) -> bool:
 
 
 def _evaluate(function: Callable[..., Any], problem: Problem) -> Any:
-    """`_value` or `_value_and_gradient` of all sequences of a problem."""
+    """`_value` or `value_and_gradient` of all sequences of a problem."""
     model, loss, transforms, params, data, theta = problem
     run = _over_devices(function, model.batch_size, _is_short(data))
     if theta is None:
@@ -123,7 +134,7 @@ def gradients(
 
 def gradients_of(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """`gradients` of a problem that is checked."""
-    value, gradient = _evaluate(_value_and_gradient, problem)
+    value, gradient = _evaluate(value_and_gradient, problem)
     return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
 
 

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.core.batching import BatchSize
+
 
 def whole_sequence(params: Any, sequence: Any) -> Any:
     """The sequence as it is: `Model.inputs` by default."""
@@ -86,14 +88,15 @@ class Model(NamedTuple):
             number of steps T.
         check: Parameters, data [B] and their name for messages, to both in arrays; raises
             ValueError where they do not fit the model. Nothing is compiled yet.
-        batch_size: Number of sequences that a device runs together; bounds memory.
+        batch_size: Number of sequences that a device runs together; bounds memory. Of a
+            `BatchSize` that of the devices.
     """
 
     init: Callable[..., Any]
     step: Callable[..., tuple[Any, Any]]
     inputs: Callable[..., Any] = whole_sequence
     check: Callable[..., tuple[Any, Any]] = as_arrays
-    batch_size: int = 512
+    batch_size: int | BatchSize = 512
 
 
 def run_model(model: Model, params: Any, sequence: Any) -> tuple[Any, Any]:

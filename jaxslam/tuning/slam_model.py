@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from jaxslam.core.batching import BatchSize
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import as_count
@@ -120,6 +121,7 @@ def as_model(model: Model | Config) -> Model:
     for name, function in model._asdict().items():
         if name != "batch_size" and not callable(function):
             raise ValueError(f"model.{name} is {function!r}, not a function")
-    as_count("model.batch_size", model.batch_size)
+    if not isinstance(model.batch_size, BatchSize):
+        as_count("model.batch_size", model.batch_size)
     check_hashable("model", model)
     return model

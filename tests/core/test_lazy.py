@@ -7,7 +7,7 @@ import pytest
 import jaxslam
 import jaxslam.mapping
 
-LAZY = ("core", "evaluation", "io", "mapping")
+LAZY = ("core", "evaluation", "filtering", "io", "mapping", "matching", "pipeline")
 
 
 @pytest.mark.parametrize("package", LAZY)

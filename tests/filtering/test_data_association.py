@@ -1,5 +1,7 @@
 """Matches that are verified, duplicates, missed detections, and the tracks of landmarks."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,8 +49,17 @@ def reference(s, residual, rank, rounds):
     return np.isin(np.arange(len(rank)), left)
 
 
+def all_but_first(passed):
+    return passed & (jnp.arange(passed.size) > 0)
+
+
 def test_greedy_joint_compatibility_equals_its_definition():
-    fast, sizes = jax.jit(lambda *given: jointly_compatible(*given).kept), []
+    sizes: list[int] = []
+
+    @partial(jax.jit, static_argnums=3)
+    def fast(s, residual, rank, review=None):
+        return jointly_compatible(s, residual, rank, review=review)
+
     for seed in range(40):
         rng = np.random.default_rng(seed)
         root, m = rng.normal(size=(10, 10)), 5
@@ -60,7 +71,20 @@ def test_greedy_joint_compatibility_equals_its_definition():
         rank = np.array([2, 2, 2, 2, 0], np.int32)
         expected = reference(s, residual, rank, 3)
         sizes.append(expected.sum())
-        np.testing.assert_array_equal(fast(s, residual, rank), expected)
+        found = fast(s, residual, rank)
+        np.testing.assert_array_equal(found.kept, expected)
+        np.testing.assert_array_equal(found.passed, expected)
+        # Its factor is of what is left, and a review leaves out what it does not keep.
+        reviewed = fast(s, residual, rank, all_but_first)
+        np.testing.assert_array_equal(reviewed.passed, expected)
+        np.testing.assert_array_equal(reviewed.kept, expected & (np.arange(m) > 0))
+        for matches in (found, reviewed):
+            rows = np.repeat(matches.kept, 2)
+            left = np.where(rows[:, None] & rows[None], s, np.eye(2 * m))
+            root, logdet, is_definite = matches.factor
+            np.testing.assert_allclose(root @ left @ root.T, np.eye(2 * m), atol=1e-10)
+            np.testing.assert_allclose(logdet, np.linalg.slogdet(left)[1], atol=1e-10)
+            assert is_definite
     assert min(sizes) < 4 and max(sizes) == 4
 
 

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam.core.linalg import inverse_cholesky
 from jaxslam.filtering import covariance
 from jaxslam.filtering.joint_covariance import CovarianceBlocks, LinearizedMeasurements
-from jaxslam.filtering.kalman import kalman_update
+from jaxslam.filtering.kalman import Innovation, kalman_update, project
 
 L, M = 5, 3
 WEIGHT = np.random.default_rng(9).normal(size=(2, 3 + 2 * L, 3 + 2 * L))
@@ -69,6 +70,31 @@ def test_the_update_equals_the_textbook(used, large, monkeypatch):
 
     for mine, theirs in zip(jax.jit(traced_anew)(cov, rows), textbook(cov, rows), strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-10)
+
+
+@pytest.mark.parametrize("used", [M, 1])
+def test_an_innovation_that_is_known_gives_the_same_update_and_derivative(used):
+    cov, rows = problem(used, used=used)
+
+    @partial(jax.jit, static_argnums=0)
+    def update_and_slope(is_known, cov, rows):
+        def update(cov, rows):
+            known = None
+            if is_known:
+                products, s = jax.lax.stop_gradient(project(blocks(cov), rows))
+                known = Innovation(*products, *inverse_cholesky(s))
+            return kalman_update(blocks(cov), rows, known)
+
+        def loss(cov, residual):
+            result = update(cov, rows._replace(residual=residual))
+            return (
+                result.nis + result.logdet + jnp.sum(jnp.sin(result.shift)) + result.cov.map[1, 2]
+            )
+
+        return update(cov, rows), jax.grad(loss, argnums=(0, 1))(cov, rows.residual)
+
+    same = partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
+    jax.tree.map(same, update_and_slope(True, cov, rows), update_and_slope(False, cov, rows))
 
 
 @partial(jax.jit, static_argnums=0)

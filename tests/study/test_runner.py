@@ -131,7 +131,7 @@ class Numbers(NamedTuple):
 @pytest.mark.parametrize("num_trials", [3, 50])
 def test_what_is_timed_has_the_shapes_of_what_was_computed_before(num_trials):
     """Whatever is compiled for the first results of each size is compiled in the warm-up."""
-    per_round = EPISODE_BATCH * jax.device_count()
+    per_round = EPISODE_BATCH.on("cpu") * jax.device_count()
     sizes = []
 
     def results(total, first):

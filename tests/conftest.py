@@ -28,7 +28,6 @@ jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
-
 def share_contexts() -> None:
     """Let all programs of a thread be written in one context of MLIR.
 

@@ -11,6 +11,7 @@ branch_cells, global_edge_code_bits, global_edge_codes = map(
     (voronoi.branch_cells, global_codes.global_edge_code_bits, global_codes.global_edge_codes),
 )
 
+
 def codes(occupied):
     return np.asarray(global_edge_codes(jnp.asarray(occupied, bool)))
 

@@ -158,9 +158,7 @@ def test_segments_begin_at_breaks_and_hold_no_beam_without_return(scans):
     assert begins[breaks].all() and begins[~hit].all()
     assert not begins[hit & ~breaks].all() and begins[hit & ~breaks].any()
     for k in range(SCANS):
-        intervals = longest_intervals(
-            jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40
-        )
+        intervals = longest_intervals(jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40)
         member = np.asarray(intervals.interval_of_beam(SMALL.num_beams)) < 40
         np.testing.assert_array_equal(member, hit[k])
 

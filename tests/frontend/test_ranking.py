@@ -12,6 +12,7 @@ bearing, sorted_three = jax.jit(lidar.bearing), jax.jit(ranking.sorted_three)
 first_true = jax.jit(ranking.first_true, static_argnums=1)
 stable_order = jax.jit(ranking.stable_order)
 
+
 @pytest.mark.parametrize("seed", range(4))
 def test_order_is_that_of_a_stable_sort(seed):
     key = np.random.default_rng(seed).integers(0, 5, 24).astype(np.float32)  # with ties

@@ -113,7 +113,9 @@ def test_who_explains_much_less_is_given_up_but_nowhere_never():
 
 def test_small_matrices_are_those_of_linear_algebra():
     cov = some(np.random.default_rng(2), 6).cov
-    np.testing.assert_allclose(jax.jit(jax.vmap(hypotheses.inverse))(cov), np.linalg.inv(cov), rtol=1e-9)
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(hypotheses.inverse))(cov), np.linalg.inv(cov), rtol=1e-9
+    )
     widest = np.sqrt(np.linalg.eigvalsh(np.asarray(cov)[:, :2, :2])[:, -1])
     np.testing.assert_allclose(jax.jit(jax.vmap(hypotheses.widest_std))(cov), widest)
 

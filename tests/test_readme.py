@@ -14,7 +14,10 @@ READMES = sorted(
 )
 SLOW = [
     "README.md",
-    *(f"jaxslam/{name}/README.md" for name in ("simulation", "pipeline", "tuning")),
+    *(
+        f"jaxslam/{name}/README.md"
+        for name in ("simulation", "pipeline", "tuning", "localisation", "study")
+    ),
 ]
 LONGEST = {"README.md": 250, "jaxslam/cli/README.md": 90, "experiments/README.md": 90}
 PROGRAM_LINES = 15

@@ -5,6 +5,7 @@ from jax import lax
 
 from jaxslam.core.features import Features
 from jaxslam.core.linalg import add_outer_products, inverse_cholesky
+from jaxslam.core.ranking import stable_order
 from jaxslam.core.se2 import transform, wrap_angle, wrap_direction
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering.belief import Belief, prune
@@ -102,7 +103,7 @@ def augment(
     check_linearisation(linearisation)
     size, max_new = belief.num_seen.size, min(max_new, wanted.size)
     # Wanted features first, so that a few rows suffice.
-    order = jnp.argsort(~wanted, stable=True)[:max_new]
+    order = stable_order(jnp.where(wanted, 0.0, 1.0))[:max_new]
     if new_slot is None:
         if cost is None:
             cost = jnp.where(belief.num_seen == 0, 0.0, jnp.inf)

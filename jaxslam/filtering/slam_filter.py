@@ -8,6 +8,7 @@ from jax import lax
 
 from jaxslam.core.features import Features, restrict_features
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.ranking import stable_order
 from jaxslam.core.se2 import rotation
 from jaxslam.core.types import WALL, Array
 from jaxslam.filtering import ekf, robust
@@ -192,8 +193,8 @@ def _choose(config: FilterConfig, belief: Belief, features: Features, slot: Arra
     size = belief.num_seen.size
     observations = belief.num_seen.at[slot].get(mode="fill", fill_value=0) + 1
     used = (slot < size) & (observations >= required_observations(config, features.kind))
-    priority = jnp.where(used, jnp.where(features.kind == WALL, 2, 1), 0)
-    order = jnp.argsort(-priority, stable=True)[: config.max_updates]
+    turn = jnp.where(used, jnp.where(features.kind == WALL, 0.0, 1.0), 2.0)
+    order = stable_order(turn)[: config.max_updates]
     used &= jnp.zeros_like(used).at[order].set(True)
     return Matches(slot, used, order)
 

@@ -16,6 +16,8 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.io import noise_file
 from jaxslam.tuning import losses
 
+pytestmark = pytest.mark.slow  # all that share one tuning
+
 # The command runs in processes of its own, in float32 as users run it, on drives so short and with
 # programs so little optimised (`conftest`) that starting takes longest.
 MAIN = (
@@ -203,13 +205,11 @@ def test_progress_and_a_summary_are_printed(done):
     assert found == done.numbers["consistency"]["after"]["verdicts"][:3]
 
 
-@pytest.mark.slow
 def test_no_evaluation_is_lost_when_the_process_is_killed(stopped):
     assert 0 < stopped.history[0] and stopped.history[-1] < UPDATES
     assert (np.diff(stopped.history) > 0).all()
 
 
-@pytest.mark.slow
 def test_an_interrupt_leaves_the_best_so_far_and_says_how_to_resume(stopped):
     said, errors = stopped.interrupted
     assert f"resuming after evaluation {stopped.history[-1]} of {UPDATES + 1}" in said
@@ -252,7 +252,6 @@ def test_another_tuning_does_not_resume_in_the_same_folder(
     assert "--out" in line
 
 
-@pytest.mark.slow
 def test_a_resumed_tuning_ends_as_an_uninterrupted_one(stopped, done):
     """The last test of a stopped tuning: it resumes to the end."""
     said, _ = end(begin(done.place, stopped.out))

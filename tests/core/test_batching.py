@@ -29,7 +29,7 @@ def function(item):
 @pytest.mark.parametrize("count, size", [(7, 3), (6, 3), (2, 5), (1, 1)])
 def test_map_batches_equals_vmap(count, size):
     ours = map_batches(function, items(count), batch_size=size)
-    assert_same(ours, jax.vmap(function)(items(count)))
+    assert_same(ours, jax.jit(jax.vmap(function))(items(count)))
 
 
 def test_padding_repeats_the_last_and_keeps_the_kind_of_array():
@@ -51,7 +51,7 @@ def test_sequential_vmap_is_vmap_at_any_depth_with_shared_arguments():
     some = {"a": jnp.arange(24.0).reshape(2, 3, 4), "b": jnp.arange(6).reshape(2, 3)}
     other = jnp.arange(8.0).reshape(2, 4)
     sequential = jax.jit(doubly_mapped(sequential_vmap_on_cpu(scaled_sum)))
-    assert_same(sequential(some, other), doubly_mapped(scaled_sum)(some, other))
+    assert_same(sequential(some, other), jax.jit(doubly_mapped(scaled_sum))(some, other))
 
 
 def absolute(x):
@@ -72,7 +72,8 @@ def test_a_condition_stays_a_branch_under_a_sequential_vmap():
 @pytest.mark.parametrize("kind", [np.asarray, jnp.asarray])
 def test_items_may_be_arrays_of_numpy_or_jax(kind):
     given = jax.tree.map(kind, items(5))
-    assert_same(map_batches(function, given, batch_size=2), jax.vmap(function)(items(5)))
+    mapped = jax.jit(jax.vmap(function))(items(5))
+    assert_same(map_batches(function, given, batch_size=2), mapped)
 
 
 @pytest.mark.parametrize(
@@ -92,9 +93,9 @@ def test_items_that_cannot_be_mapped_are_refused(items, size, message):
 
 @pytest.mark.parametrize("block", [1, 3, 8])
 def test_updates_where_wanted_are_those_of_the_loop(block):
-    wanted = jnp.array([True, False, True, True, False, True, True])
-    state = {"a": jnp.arange(7.0), "b": jnp.arange(14.0).reshape(7, 2)}
-    own, shared = jnp.arange(7.0) + 10.0, jnp.array([2.0, 3.0])
+    wanted = np.array([True, False, True, True, False, True, True])
+    state = {"a": np.arange(7.0), "b": np.arange(14.0).reshape(7, 2)}
+    own, shared = np.arange(7.0) + 10.0, np.array([2.0, 3.0])
 
     def update(state, own, shared):
         return {"a": state["a"] + own, "b": state["b"] * shared}
@@ -102,11 +103,11 @@ def test_updates_where_wanted_are_those_of_the_loop(block):
     def one(wanted, state, own):
         return update_where(wanted, update, state, own, shared, block=block)
 
-    found = jax.jit(jax.vmap(one))(wanted, state, own)
+    found, alone = jax.jit(jax.vmap(one))(wanted, state, own), jax.jit(one)
     for k in range(7):
         item = jax.tree.map(lambda x: x[k], state)  # noqa: B023
         expected = update(item, own[k], shared) if wanted[k] else item
-        jax.tree.map(np.testing.assert_array_equal, expected, one(wanted[k], item, own[k]))
+        jax.tree.map(np.testing.assert_array_equal, expected, alone(wanted[k], item, own[k]))
         of_batch = jax.tree.map(lambda x: x[k], found)  # noqa: B023
         jax.tree.map(np.testing.assert_array_equal, expected, of_batch)
 

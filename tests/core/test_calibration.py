@@ -203,17 +203,18 @@ def test_the_closed_form_of_noisy_increments_is_near():
 def test_least_squares_of_the_calibration_agrees_with_the_closed_form():
     """By autodiff's Gauss-Newton on the noisy increments of the scanner, within the noise."""
     wheels, scanner = robot_increments(np.random.default_rng(2), 400, noise=1e-3)
-    reported = arcs(jnp.asarray(wheels))
-    padded = jnp.concatenate([jnp.zeros((1, 3)), reported])
+    reported = jax.jit(arcs)(jnp.asarray(wheels))
+    padded = jnp.asarray(np.concatenate([np.zeros((1, 3)), reported]))
 
+    @jax.jit
     def residuals(theta):
         given = Calibration.of_wheels(*theta[:3], wheel_base=BASE)._replace(mount=theta[3:])
         return (calibrate_odometry(given, padded, wheel_base=BASE)[1:] - scanner).ravel()
 
-    theta, both = jnp.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), jax.jit(jax.jacfwd(residuals))
+    theta, both = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), jax.jit(jax.jacfwd(residuals))
     for _ in range(6):
-        slope = both(theta)
-        theta = theta - jnp.linalg.lstsq(slope, residuals(theta))[0]
+        slope = np.asarray(both(theta))
+        theta = theta - np.linalg.lstsq(slope, np.asarray(residuals(theta)))[0]
     error = 1e-3 * np.sqrt(np.diag(np.linalg.inv(slope.T @ slope)))
     found = censi(wheels, scanner) / np.array([1, 1, BASE, 1, 1, 1])
     assert np.all(np.abs(found - theta) < STANDARD_ERRORS * error)

@@ -111,12 +111,21 @@ def test_a_device_map_traces_once_whatever_the_number_of_batches():
     assert len(traces) == 1
 
 
+@pytest.fixture
+def few_objects():
+    """Of all that other tests have left, nothing is looked through again by the collector."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
 def live_programs():
     gc.collect()
     return len(jax.devices()[0].client.live_executables())
 
 
-def test_devices_of_the_cpu_share_one_compiled_program():
+def test_devices_of_the_cpu_share_one_compiled_program(few_objects):
     device_map = DeviceMap(scaled, size=3, static=1)
     given = 5, {"by": np.float64(0.3)}, jax.tree.map(np.asarray, items(17))
     _runner.cache_clear()
@@ -127,7 +136,7 @@ def test_devices_of_the_cpu_share_one_compiled_program():
     assert_same(both, alone)
 
 
-def test_devices_with_memory_of_their_own_have_programs_of_their_own(monkeypatch):
+def test_devices_with_memory_of_their_own_have_programs_of_their_own(monkeypatch, few_objects):
     device_map = DeviceMap(scaled, size=3, static=1)
     given = 6, {"by": np.float64(0.3)}, jax.tree.map(np.asarray, items(17))
     shared = device_map(*given, devices=jax.devices()[:2])
@@ -141,7 +150,7 @@ def power_of(exponent, common, item):
     return common * item**exponent
 
 
-def test_a_process_keeps_a_bounded_number_of_programs():
+def test_a_process_keeps_a_bounded_number_of_programs(few_objects):
     """What is compiled for a CPU takes up memory maps, of which a process has only so many."""
 
     device_map = DeviceMap(power_of, size=2, static=1)

@@ -1,16 +1,24 @@
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core import se2, se2_np
+from jaxslam.core import se2 as se2_module
+from jaxslam.core import se2_np
 
 SEEDS = range(5)
+se2 = SimpleNamespace(
+    **{k: jax.jit(f) for k, f in vars(se2_module).items() if hasattr(se2_np, k) and callable(f)},
+    **{k: jax.jit(getattr(se2_module, k)) for k in ("cross", "dot", "range_bearing", "rotation")},
+    **{k: jax.jit(getattr(se2_module, k)) for k in ("unit_vector", "wrap_direction")},
+)
 
 
 def poses(seed):
     """Three poses (3, 3) up to some metres from the origin, with any heading."""
-    return jax.random.uniform(jax.random.key(seed), (3, 3), minval=-3.1, maxval=3.1)
+    return np.random.default_rng(seed).uniform(-3.1, 3.1, (3, 3))
 
 
 def matrix(pose):
@@ -46,7 +54,7 @@ def test_relative_is_the_inverse_of_compose(seed):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_inverse_transform_is_the_inverse_of_transform(seed):
     pose = poses(seed)[0]
-    points = jax.random.normal(jax.random.key(seed + 100), (4, 7, 2))
+    points = np.random.default_rng(seed + 100).normal(size=(4, 7, 2))
     there = se2.transform(pose, points)
     np.testing.assert_allclose(se2.inverse_transform(pose, there), points, atol=1e-12)
     np.testing.assert_allclose(there[2, 3], (matrix(pose) @ [*points[2, 3], 1])[:2], atol=1e-12)
@@ -55,21 +63,21 @@ def test_inverse_transform_is_the_inverse_of_transform(seed):
 
 
 def test_wrap_angle_keeps_the_direction_and_the_slope():
-    angles = jnp.linspace(-20, 20, 401)
+    angles = np.linspace(-20, 20, 401)
     wrapped = se2.wrap_angle(angles)
     assert np.all((wrapped >= -np.pi) & (wrapped < np.pi))
     np.testing.assert_allclose(se2.unit_vector(wrapped), se2.unit_vector(angles), atol=1e-12)
-    np.testing.assert_allclose(jax.vmap(jax.grad(se2.wrap_angle))(angles), 1.0)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(se2.wrap_angle)))(angles), 1.0)
 
 
 def test_wrap_direction_keeps_the_line():
-    angles = jnp.linspace(-20, 20, 401)
+    angles = np.linspace(-20, 20, 401)
     wrapped = se2.wrap_direction(angles)
     assert np.all((wrapped >= -np.pi / 2) & (wrapped < np.pi / 2))
     np.testing.assert_allclose(
         se2.unit_vector(2 * wrapped), se2.unit_vector(2 * angles), atol=1e-12
     )
-    np.testing.assert_allclose(se2.wrap_direction(angles + jnp.pi), wrapped, atol=1e-12)
+    np.testing.assert_allclose(se2.wrap_direction(angles + np.pi), wrapped, atol=1e-12)
 
 
 def test_range_bearing_is_polar_form():
@@ -81,21 +89,21 @@ def test_gradients_are_finite_at_the_origin():
     zero = jnp.zeros(3)
     np.testing.assert_array_equal(se2.range_bearing(jnp.zeros(2)), jnp.zeros(2))
     for derivative in (
-        jax.jacrev(se2.range_bearing)(jnp.zeros(2)),
-        jax.jacfwd(se2.range_bearing)(jnp.zeros(2)),
-        jax.jacrev(se2.compose, argnums=(0, 1))(zero, zero),
-        jax.jacrev(se2.relative, argnums=(0, 1))(zero, zero),
+        jax.jit(jax.jacrev(se2.range_bearing))(jnp.zeros(2)),
+        jax.jit(jax.jacfwd(se2.range_bearing))(jnp.zeros(2)),
+        jax.jit(jax.jacrev(se2.compose, argnums=(0, 1)))(zero, zero),
+        jax.jit(jax.jacrev(se2.relative, argnums=(0, 1)))(zero, zero),
     ):
-        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative))
 
 
 def test_cross_and_dot_are_sine_and_cosine():
-    a, b = jnp.array([0.3, 1.1]), jnp.array([[2.0, -0.4], [0.5, 0.5]])
+    a, b = np.array([0.3, 1.1]), np.array([[2.0, -0.4], [0.5, 0.5]])
     np.testing.assert_allclose(
-        se2.cross(se2.unit_vector(a), se2.unit_vector(a + b[0])), jnp.sin(b[0]), atol=1e-12
+        se2.cross(se2.unit_vector(a), se2.unit_vector(a + b[0])), np.sin(b[0]), atol=1e-12
     )
     np.testing.assert_allclose(
-        se2.dot(se2.unit_vector(a), se2.unit_vector(a + b[0])), jnp.cos(b[0]), atol=1e-12
+        se2.dot(se2.unit_vector(a), se2.unit_vector(a + b[0])), np.cos(b[0]), atol=1e-12
     )
 
 
@@ -114,7 +122,7 @@ def test_dead_reckoning_composes_increments():
 
 @pytest.mark.parametrize("module", [se2, se2_np])
 def test_increments_are_the_inverse_of_dead_reckoning(module):
-    path = np.concatenate([np.asarray(poses(seed)) for seed in SEEDS])
+    path = np.concatenate([poses(seed) for seed in SEEDS])
     path = path if module is se2_np else jnp.asarray(path)
     steps = module.increments(path)
     assert steps.shape == path.shape and not steps[0].any()
@@ -124,15 +132,15 @@ def test_increments_are_the_inverse_of_dead_reckoning(module):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_numpy_and_jax_agree(seed):
     a, b, c = poses(seed)
-    points = jax.random.normal(jax.random.key(seed), (4, 7, 2))
+    points = np.random.default_rng(seed).normal(size=(4, 7, 2))
     for name, args in (
-        ("wrap_angle", (jnp.linspace(-20, 20, 401),)),
+        ("wrap_angle", (np.linspace(-20, 20, 401),)),
         ("compose", (a, b)),
         ("relative", (a, b)),
         ("transform", (a, points)),
         ("inverse_transform", (a, points)),
-        ("dead_reckoning", (a, jnp.stack([b, c]))),
-        ("increments", (jnp.stack([a, b, c]),)),
+        ("dead_reckoning", (a, np.stack([b, c]))),
+        ("increments", (np.stack([a, b, c]),)),
     ):
         expected = getattr(se2, name)(*args)
         found = getattr(se2_np, name)(*map(np.asarray, args))
@@ -141,10 +149,10 @@ def test_numpy_and_jax_agree(seed):
 
 
 def test_numpy_takes_many_poses_at_once():
-    a, b = np.asarray(poses(0)), np.asarray(poses(1))
+    a, b = poses(0), poses(1)
     for name in ("compose", "relative"):
-        expected = jax.vmap(getattr(se2, name))(a, b)
+        expected = jax.jit(jax.vmap(getattr(se2, name)))(a, b)
         np.testing.assert_allclose(getattr(se2_np, name)(a, b), expected, atol=1e-12)
     for name in ("transform", "inverse_transform"):
-        expected = jax.vmap(getattr(se2, name))(a, b[:, :2])
+        expected = jax.jit(jax.vmap(getattr(se2, name)))(a, b[:, :2])
         np.testing.assert_allclose(getattr(se2_np, name)(a, b[:, :2]), expected, atol=1e-12)

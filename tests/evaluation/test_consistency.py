@@ -7,6 +7,9 @@ from scipy.stats import chi2
 
 from jaxslam.evaluation import consistency
 
+nees, rmse = jax.jit(consistency.nees), jax.jit(consistency.rmse)
+slope_of_rmse = jax.jit(jax.grad(consistency.rmse))
+
 
 def covariances(seed, count, k):
     """Well-conditioned covariances (count, k, k)."""
@@ -24,11 +27,9 @@ def test_nees_equals_solving(k):
     cov = covariances(k, 50, k)
     error = np.random.default_rng(9).normal(size=(50, k))
     expected = np.sum(error * np.linalg.solve(cov, error[..., None])[..., 0], axis=-1)
-    found = jax.jit(consistency.nees)(jnp.array(error), jnp.array(cov))
+    found = nees(jnp.array(error), jnp.array(cov))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-    np.testing.assert_allclose(
-        consistency.nees(jnp.array(error[7]), jnp.array(cov[7])), expected[7]
-    )
+    np.testing.assert_allclose(nees(jnp.array(error[7]), jnp.array(cov[7])), expected[7])
 
 
 def test_nees_in_single_precision_with_unequal_scales():
@@ -36,7 +37,7 @@ def test_nees_in_single_precision_with_unequal_scales():
     corr = np.array([[1.0, 0.99, -0.9], [0.99, 1.0, -0.9], [-0.9, -0.9, 1.0]])
     cov = corr * np.outer(scale, scale)
     error = scale * np.array([0.5, -0.4, 1.2])
-    found = consistency.nees(jnp.array(error, jnp.float32), jnp.array(cov, jnp.float32))
+    found = nees(jnp.array(error, jnp.float32), jnp.array(cov, jnp.float32))
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, error @ np.linalg.solve(cov, error), rtol=1e-4)
 
@@ -48,37 +49,38 @@ def test_nees_of_invalid_numbers_is_infinite_with_zero_gradient():
     cov[1, 2, 2] = np.inf
     cov[2, 0, 0] = -1.0
     cov[3] = 1.0  # singular
-    found = consistency.nees(jnp.array(error), jnp.array(cov))
+    found = nees(jnp.array(error), jnp.array(cov))
     np.testing.assert_array_equal(found, [np.inf] * 4 + [3.0])
 
     def total(error, cov):
         values = consistency.nees(error, cov)
         return jnp.sum(jnp.where(jnp.isfinite(values), values, 0.0))
 
-    by_error, by_cov = jax.grad(total, argnums=(0, 1))(jnp.array(error), jnp.array(cov))
+    slopes = jax.jit(jax.grad(total, argnums=(0, 1)))
+    by_error, by_cov = slopes(jnp.array(error), jnp.array(cov))
     np.testing.assert_array_equal(by_error, [[0.0] * 3] * 4 + [[2.0] * 3])
     assert jnp.isfinite(by_cov).all() and not by_cov[:4].any() and by_cov[4].any()
 
 
 def test_nees_gradient_matches_finite_differences():
     error, cov = jnp.array([0.3, -0.2, 0.1]), jnp.array(covariances(4, 1, 3)[0])
-    check_grads(lambda scale: consistency.nees(error, scale * cov), (1.3,), order=1, rtol=1e-5)
+    check_grads(lambda scale: nees(error, scale * cov), (1.3,), order=1, rtol=1e-5)
 
 
 def test_rmse_ignores_what_the_mask_leaves_out():
     values, mask = jnp.array([3.0, jnp.nan, 4.0, 100.0]), jnp.array([True, False, True, False])
-    np.testing.assert_allclose(consistency.rmse(values, mask), np.sqrt(12.5))
-    slope = jax.grad(consistency.rmse)(values, mask)
+    np.testing.assert_allclose(rmse(values, mask), np.sqrt(12.5))
+    slope = slope_of_rmse(values, mask)
     np.testing.assert_allclose(slope, np.array([3.0, 0.0, 4.0, 0.0]) / 2 / np.sqrt(12.5))
 
 
 def test_rmse_of_nothing_and_of_no_error():
     values, none = jnp.array([1.0, 2.0]), jnp.array([False, False])
-    assert jnp.isnan(consistency.rmse(values, none))
-    assert not jax.grad(consistency.rmse)(values, none).any()
+    assert jnp.isnan(rmse(values, none))
+    assert not slope_of_rmse(values, none).any()
     zero, everything = jnp.zeros(2), jnp.array([True, True])
-    assert consistency.rmse(zero, everything) == 0.0
-    assert not jax.grad(consistency.rmse)(zero, everything).any()
+    assert rmse(zero, everything) == 0.0
+    assert not slope_of_rmse(zero, everything).any()
 
 
 @pytest.mark.parametrize("dof, count, probability", [(3, 1, 0.95), (3, 100, 0.95), (2, 7, 0.99)])
@@ -92,7 +94,7 @@ def test_chi_square_bounds_equal_the_quantiles(dof, count, probability):
 def test_nees_per_dof_of_a_consistent_filter_is_about_one():
     cov, rng = covariances(5, 1, 3)[0], np.random.default_rng(5)
     error = rng.multivariate_normal(np.zeros(3), cov, 4000)
-    values = np.asarray(consistency.nees(error, np.tile(cov, (4000, 1, 1))))
+    values = np.asarray(nees(error, np.tile(cov, (4000, 1, 1))))
     low, high = consistency.chi_square_bounds(3, 4000, 0.999)
     assert low < values.mean() < high
     assert consistency.nees_per_dof(values.mean()) == values.mean() / 3

@@ -122,6 +122,7 @@ class Stop(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_path, monkeypatch):
     """Stopped after the first file, as kill -9 would: a part of the next one is left."""
     folder = tmp_path / "runs"
@@ -144,6 +145,7 @@ def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_pat
     assert [f.name for f in sorted(folder.glob("*.npz"))] == ["0000000.npz", "0000008.npz"]
 
 
+@pytest.mark.slow
 def test_trials_of_another_seed_are_not_mixed_in(done):
     with pytest.raises(InputError, match="has trials of another variant, seed"):
         monte_carlo.work(case(), SEED + 1, NUM_TRIALS, done[1])
@@ -156,6 +158,7 @@ def kept(folder):
         return TrialResult(*(saved[name] for name in TrialResult._fields))
 
 
+@pytest.mark.slow
 def test_the_distribution_is_that_of_the_trials(done):
     numbers, folder = done
     results = kept(folder)
@@ -170,6 +173,7 @@ def test_the_distribution_is_that_of_the_trials(done):
     assert numbers["largest_m"] == pytest.approx(off.max())
 
 
+@pytest.mark.slow
 def test_trials_that_are_not_finite_are_masked_and_listed(done):
     numbers, folder = done
     results = kept(folder)
@@ -185,6 +189,7 @@ def test_trials_that_are_not_finite_are_masked_and_listed(done):
     assert none["p50_m"] is None and none["worst"] == []
 
 
+@pytest.mark.slow
 def test_one_trial_is_replayed_alone(done):
     worst = done[0]["worst"][0]
     alone = monte_carlo.replay(case(), SEED, worst["run"])
@@ -192,6 +197,7 @@ def test_one_trial_is_replayed_alone(done):
     np.testing.assert_array_equal(alone["worst"][0]["estimate"], worst["estimate"])
 
 
+@pytest.mark.slow
 def test_picture_and_numbers_are_written_and_kept_trials_are_removed(done, tmp_path, monkeypatch):
     row = {"devices": 1, "seconds": 2.0, "ms_per_scan": 1.0, "peak_mb": 500.0}
     rows = {name: [row | {name: v} for v in values] for name, values in scaling.VARIED.items()}

@@ -13,6 +13,7 @@ from jaxslam.filtering.joint_covariance import CovarianceBlocks, LinearizedMeasu
 from jaxslam.filtering.kalman import innovation_cov
 
 SPEC = AdaptationSpec(memory=100.0)
+adapt_once = jax.jit(partial(adapt, SPEC))
 SIZE = jnp.array([2, 2, 1], jnp.int32)  # two points and a wall
 Q = jnp.diag(jnp.array([0.02, 0.01, 0.005]))
 TRUE = jnp.array([1.2, -0.8])  # logarithms of the variances' scales, of Q and R
@@ -28,6 +29,7 @@ def rows_of(seed=0):
     return LinearizedMeasurements(*arrays, jnp.arange(3, dtype=jnp.int32))
 
 
+@jax.jit
 def scaled(log_variance):
     """Covariance of a prediction with the scaled Q, scaled Q, and rows with scaled R."""
     by_q, by_r = jnp.exp(log_variance)
@@ -63,7 +65,7 @@ def adapted(key, *, steps):
 def test_it_converges_to_the_true_scales_with_the_stated_spread():
     count = 100
     keys = jax.random.split(jax.random.key(0), count)
-    end = jax.vmap(partial(adapted, steps=600))(keys)
+    end = jax.jit(jax.vmap(partial(adapted, steps=600)))(keys)
     error = np.asarray(end.log_variance) - np.asarray(TRUE)
     one_step = np.asarray(end.information.mean(axis=0)) / SPEC.memory
     expected = np.linalg.inv(one_step) / (2 * SPEC.memory - 1)
@@ -76,7 +78,7 @@ def test_it_converges_to_the_true_scales_with_the_stated_spread():
 
 def test_the_step_is_the_derivative_of_the_likelihood():
     """By autodiff of the Gaussian log-density of the numbers that count."""
-    v = innovations(jax.random.key(1), 1)[0]
+    v = jax.jit(innovations, static_argnums=1)(jax.random.key(1), 1)[0]
     at = jnp.array([0.3, 0.2])
 
     @jax.jit
@@ -89,29 +91,29 @@ def test_the_step_is_the_derivative_of_the_likelihood():
     cov, own_q, rows = scaled(at)
     rows = rows._replace(residual=v)
     start = Adaptation(at, 50.0 * jnp.eye(2))
-    end = jax.jit(partial(adapt, SPEC))(start, cov, rows, SIZE, own_q)
+    end = adapt_once(start, cov, rows, SIZE, own_q)
     metric = end.information + jnp.eye(2) / SPEC.prior_std**2
     step = metric @ (end.log_variance - at)
-    np.testing.assert_allclose(step, jax.grad(log_density)(at), rtol=1e-9)
+    np.testing.assert_allclose(step, jax.jit(jax.grad(log_density))(at), rtol=1e-9)
 
 
 def test_innovations_that_are_not_finite_or_none_change_nothing():
     cov, own_q, rows = scaled(jnp.zeros(2))
     start = initial_adaptation(float)
     bad = rows._replace(residual=rows.residual.at[0, 0].set(jnp.nan))
-    end = adapt(SPEC, start, cov, bad, SIZE, own_q)
+    end = adapt_once(start, cov, bad, SIZE, own_q)
     np.testing.assert_array_equal(end.log_variance, start.log_variance)
     none = LinearizedMeasurements(*(jnp.zeros_like(x) for x in rows))._replace(
         R=jnp.tile(jnp.eye(2), (3, 1, 1))
     )
-    end = adapt(SPEC, start, cov, none, jnp.zeros(3, jnp.int32), own_q)
+    end = adapt_once(start, cov, none, jnp.zeros(3, jnp.int32), own_q)
     np.testing.assert_array_equal(end.log_variance, start.log_variance)
 
 
 def test_scales_keep_within_their_limits():
     cov, own_q, rows = scaled(jnp.zeros(2))
     far = rows._replace(residual=rows.residual + 1e3)
-    end = adapt(SPEC, initial_adaptation(float), cov, far, SIZE, own_q)
+    end = adapt_once(initial_adaptation(float), cov, far, SIZE, own_q)
     assert np.exp(np.abs(end.log_variance) / 2).max() <= SPEC.max_factor * (1 + 1e-12)
 
 

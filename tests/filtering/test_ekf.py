@@ -1,6 +1,7 @@
 """Prediction, update and new landmarks, against dense EKF-SLAM, filterpy and samples."""
 
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +79,10 @@ def augmented(belief, scan, r, wanted):
     return map_management.augment(belief, scan, r, wanted, max_new=3)
 
 
+cov_of = jax.jit(lambda belief: belief.cov)
+blank_belief = jax.jit(partial(initial_belief, max_landmarks=L))
+
+
 def with_cov(belief, cov):
     """The belief with another covariance (D, D)."""
     return belief._replace(pose_cov=cov[:3, :3], cross_cov=cov[:3, 3:], map_cov=cov[3:, 3:])
@@ -92,19 +97,20 @@ def random_belief(seed, *, landmarks=4):
     # A direction has one number; the other is a certain zero.
     for slot in np.flatnonzero(KINDS[:landmarks] == WALL):
         root[4 + 2 * slot] = 0.0
-    blank = initial_belief(jnp.array(mean[:3]), max_landmarks=L)
-    return with_cov(blank, blank.cov.at[:used, :used].set(root @ root.T))._replace(
-        mean=blank.mean.at[:used].set(mean),
-        first_estimate=blank.first_estimate.at[:used].set(mean),
-        num_seen=blank.num_seen.at[:landmarks].set(2),
-        kind=blank.kind.at[:landmarks].set(jnp.array(KINDS[:landmarks], jnp.int32)),
-    )
+    blank = jax.tree.map(np.array, blank_belief(jnp.array(mean[:3])))
+    cov = np.array(blank.cov)
+    cov[:used, :used] = root @ root.T
+    for field in (blank.mean, blank.first_estimate):
+        field[:used] = mean
+    blank.num_seen[:landmarks] = 2
+    blank.kind[:landmarks] = KINDS[:landmarks]
+    return jax.tree.map(jnp.asarray, with_cov(blank, cov))
 
 
 def dense_of(belief, landmarks):
     dense, used = DenseSlam(np.zeros(3)), 3 + 2 * landmarks
     dense.mean = np.array(belief.mean[:used])
-    dense.cov = np.array(belief.cov[:used, :used])
+    dense.cov = np.array(cov_of(belief))[:used, :used]
     return dense
 
 
@@ -121,7 +127,7 @@ def observed(rng, pose, index):
 def test_twenty_steps_equal_dense_ekf_slam(seed):
     rng = np.random.default_rng(seed)
     pose, motion = np.array([0.0, 0.0, 2.9]), np.array([0.3, 0.02, 0.15])
-    belief, dense = initial_belief(jnp.array(pose), max_landmarks=L), DenseSlam(pose)
+    belief, dense = blank_belief(jnp.array(pose)), DenseSlam(pose)
     slot_of, order = {}, []
     for _ in range(20):
         pose = reference_filter.compose(pose, motion + rng.multivariate_normal(np.zeros(3), Q))
@@ -140,7 +146,7 @@ def test_twenty_steps_equal_dense_ekf_slam(seed):
             # Our wall rows have an unused second number of variance 1.
             np.testing.assert_allclose([nis, logdet], expected, atol=1e-8)
         new = [n for n in range(4) if n not in known][:3]
-        wanted = jnp.zeros(M, bool).at[jnp.array(new, int)].set(True)
+        wanted = jnp.asarray(np.isin(np.arange(M), new))
         belief, got = augmented(belief, scan, r, wanted)
         for n in new:
             dense.augment(kind[n], *cut[n])
@@ -148,10 +154,11 @@ def test_twenty_steps_equal_dense_ekf_slam(seed):
             order.append(index[n])
 
         rows = np.concatenate([np.arange(3), *[3 + 2 * slot_of[i] + np.arange(2) for i in order]])
-        np.testing.assert_allclose(belief.mean[rows], dense.mean, atol=1e-9)
-        np.testing.assert_allclose(belief.cov[np.ix_(rows, rows)], dense.cov, atol=1e-10)
+        mean, cov = np.asarray(belief.mean), np.asarray(cov_of(belief))
+        np.testing.assert_allclose(mean[rows], dense.mean, atol=1e-9)
+        np.testing.assert_allclose(cov[np.ix_(rows, rows)], dense.cov, atol=1e-10)
     assert len(order) == len(KINDS)
-    assert np.linalg.norm(belief.pose[:2] - pose[:2]) < 0.5
+    assert np.linalg.norm(np.asarray(belief.pose)[:2] - pose[:2]) < 0.5
 
 
 def test_predict_and_update_equal_filterpy():
@@ -195,7 +202,7 @@ def test_predict_and_update_equal_filterpy():
 def test_heading_and_wall_directions_are_a_linear_kalman_filter():
     rng = np.random.default_rng(1)
     walls, q, r = np.array([0.3, -0.4]), 0.02**2, WALL_STD**2
-    belief = initial_belief(jnp.array([1.0, 2.0, 0.1]), max_landmarks=L)
+    belief = blank_belief(jnp.array([1.0, 2.0, 0.1]))
     scan, noise = features([WALL, WALL], np.array([[0.2, 0], [-0.5, 0]]))
     belief, _ = augmented(belief, scan, noise, scan.valid)
     mean, cov = np.array([0.1, 0.3, -0.4]), np.diag([0.0, r, r])
@@ -206,11 +213,11 @@ def test_heading_and_wall_directions_are_a_linear_kalman_filter():
         mean, cov = reference_filter.kalman(
             mean, cov, f, np.diag([q, 0, 0]), [turn, 0, 0], h, r * np.eye(2), seen
         )
-        belief = predicted(belief, jnp.array([0, 0, turn]), jnp.diag(jnp.array([0, 0, q])))
+        belief = predicted(belief, jnp.array([0, 0, turn]), jnp.array(np.diag([0, 0, q])))
         scan, noise = features([WALL, WALL], np.stack([seen, 0 * seen], axis=-1))
         belief, _, _ = updated(belief, scan, noise, slots(0, 1))
-        np.testing.assert_allclose(belief.mean[at], mean, atol=1e-12)
-        np.testing.assert_allclose(belief.cov[np.ix_(at, at)], cov, atol=1e-15)
+        np.testing.assert_allclose(np.asarray(belief.mean)[at], mean, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(cov_of(belief))[np.ix_(at, at)], cov, atol=1e-15)
     np.testing.assert_allclose(belief.pose[:2], [1.0, 2.0], atol=1e-15)
 
 

@@ -52,8 +52,11 @@ def drive(seed):
     return np.stack(poses), odometry, polar, ids
 
 
+features_of = jax.jit(jax.vmap(features.features_from_range_bearing))
+
+
 def measurements_of(odometry, polar, ids):
-    seen = jax.vmap(features.features_from_range_bearing)(jnp.asarray(polar), jnp.asarray(ids >= 0))
+    seen = features_of(jnp.asarray(polar), jnp.asarray(ids >= 0))
     return Measurement(jnp.asarray(odometry), seen, jnp.asarray(ids))
 
 

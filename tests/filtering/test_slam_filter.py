@@ -324,12 +324,15 @@ def test_a_junction_whose_detection_is_missed_repeatedly_is_pruned():
         events.append(counters(info))
     assert events == [{"new": 2}, {}, {}, {"pruned": 1}, {}]
     _, other = drive(0, only=lambda t: [0, 2] if t < 2 else [0])  # from outside it need not be
-    belief, _ = run(other, config)
+    belief = start(config=config)
+    for t in range(T):
+        belief, _ = stepped(config, NOISE, belief, at(other, t))
     np.testing.assert_array_equal(belief.id[belief.num_seen > 0], [0, 1])
 
 
 def test_duplicates_are_merged_into_the_older_landmark():
-    config = SMALL._replace(confirm_count=1, max_updates=1)  # the one that is matched is looked at
+    # The one that is matched is looked at.
+    config = SMALL._replace(confirm_count=1, max_updates=1, association=MERGING)
     _, measured = drive(0, only=lambda t: [0])
     belief, _ = stepped(config, NOISE, start(config=config), at(measured, 0))
     duplicate_cov = belief.map_cov[:2, :2] + 1e-3 * jnp.eye(2)
@@ -342,12 +345,7 @@ def test_duplicates_are_merged_into_the_older_landmark():
         next_id=jnp.int32(8),
     )
     before = np.trace(belief.map_cov[:2, :2])
-    belief, info = stepped(
-        config._replace(association=MERGING),
-        NOISE,
-        belief,
-        at(measured, 1),
-    )
+    belief, info = stepped(config, NOISE, belief, at(measured, 1))
     assert counters(info) == {"merged": 1}
     np.testing.assert_array_equal(belief.id[belief.num_seen > 0], [0])
     assert np.trace(belief.map_cov[:2, :2]) < before

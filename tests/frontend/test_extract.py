@@ -213,7 +213,7 @@ def test_more_junctions_than_bits_are_refused():
         jax.eval_shape(lambda: extract_local_graph(many, GOOD))
 
 
-@pytest.mark.parametrize("labels", ["segments", "codes"])
+@pytest.mark.parametrize("labels", ["segments", pytest.param("codes", marks=pytest.mark.slow)])
 def test_what_is_found_does_not_depend_on_which_beam_of_a_full_turn_is_the_first(labels):
     """A room with a doorway and a pillar, seen by scanners whose first beams look elsewhere."""
     count = 180

@@ -1,10 +1,15 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.frontend import tiled_automaton
-from jaxslam.frontend.global_edge_codes import global_edge_code_bits, global_edge_codes
-from jaxslam.frontend.voronoi import branch_cells
+from jaxslam.frontend import global_edge_codes as global_codes
+from jaxslam.frontend import tiled_automaton, voronoi
+
+branch_cells, global_edge_code_bits, global_edge_codes = map(
+    jax.jit,
+    (voronoi.branch_cells, global_codes.global_edge_code_bits, global_codes.global_edge_codes),
+)
 
 
 def codes(occupied):

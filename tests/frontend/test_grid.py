@@ -9,8 +9,9 @@ import reference
 
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.frontend import grid as grid_module
-from jaxslam.frontend.grid import GridSpec, cell_of, centre_of, centres, mark_cells, seen_free
-from jaxslam.frontend.lidar import beam_angles, beam_ends
+from jaxslam.frontend import lidar as lidar_module
+from jaxslam.frontend.grid import GridSpec
+from jaxslam.frontend.lidar import beam_angles
 from jaxslam.simulation import ray_casting, worlds
 from jaxslam.simulation.worlds import World
 
@@ -21,7 +22,19 @@ ROUND = Lidar(num_beams=360, angle_min=-math.pi, angle_increment=math.pi / 180)
 ROOM = World(worlds.outline([(-1.03, -2.04, 2.46, 1.57)]))
 POSES = [(1.013, 0.917, 0.31), (8.1, 5.03, 1.9), (14.1, 5.3, -2.2)]
 
-rasterise = jax.jit(grid_module.rasterise, static_argnums=(0, 1))
+rasterise, seen_free = (
+    jax.jit(f, static_argnums=(0, 1)) for f in (grid_module.rasterise, grid_module.seen_free)
+)
+cell_of, centre_of, centres, mark_cells, beam_ends = (
+    jax.jit(f, static_argnums=0)
+    for f in (
+        grid_module.cell_of,
+        grid_module.centre_of,
+        grid_module.centres,
+        grid_module.mark_cells,
+        lidar_module.beam_ends,
+    )
+)
 cast = jax.jit(ray_casting.cast, static_argnums=0)
 
 
@@ -64,10 +77,11 @@ def test_cells_are_occupied_or_free_or_unknown(pose):
 def test_every_hit_is_occupied_and_the_second_cell_covers_no_free_one(pose):
     scan = office_scan(pose)
     grid = rasterise(FRONT, SPEC, scan)
-    hits = np.asarray(cell_of(SPEC, beam_ends(FRONT, scan)[scan.hit]))
-    hits = hits[hits[:, 0] < SPEC.shape[0]]
+    cells = np.asarray(cell_of(SPEC, beam_ends(FRONT, scan)))
+    cells = np.where(np.asarray(scan.hit)[:, None], cells, SPEC.shape)
+    hits = cells[cells[:, 0] < SPEC.shape[0]]
     assert np.asarray(grid.occupied)[tuple(hits.T)].all()
-    front = np.asarray(mark_cells(SPEC, hits))
+    front = np.asarray(mark_cells(SPEC, cells))
     behind = np.asarray(grid.occupied) & ~front
     assert behind.any() and not np.any(behind & np.asarray(seen_free(FRONT, SPEC, scan)))
 
@@ -111,7 +125,7 @@ def test_cells_that_beams_pass_through_are_free(lidar):
     xy = before_hits(scan, lidar, short=0.2)
     spec = SMALL._replace(x_min=-3.0)
     seen = np.abs(np.arctan2(xy[:, 1], xy[:, 0])) < np.max(beam_angles(lidar)) - 0.3
-    cells = np.unique(cell_of(spec, jnp.asarray(xy[seen])), axis=0)
+    cells = np.unique(np.asarray(cell_of(spec, jnp.asarray(xy)))[seen], axis=0)
     assert np.asarray(rasterise(lidar, spec, scan).free)[tuple(cells.T)].all()
     assert len(cells) > 500
 
@@ -164,7 +178,7 @@ def test_grids_are_batched():
     "call, message",
     [
         (
-            lambda s: seen_free(FRONT, SPEC, s),
+            lambda s: grid_module.seen_free(FRONT, SPEC, s),
             "scan.ranges is float64 (2, 361), not floating (361,)",
         ),
         (

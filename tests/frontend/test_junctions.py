@@ -18,11 +18,15 @@ from jaxslam.simulation.worlds import World
 CONFIG = Config().frontend
 LIDAR, GRID, SPEC = CONFIG.lidar, CONFIG.grid, CONFIG.features
 LEVELS = CONFIG.pyramid()
-SCAN = ray_casting.cast(LIDAR, World(jnp.asarray(TRIANGLE)), jnp.array(IN_TRIANGLE))
-SEGMENTS = segmentation.find_segments(LIDAR, CONFIG.segments, SCAN)
+SCAN = jax.jit(ray_casting.cast, static_argnums=0)(
+    LIDAR, World(jnp.asarray(TRIANGLE)), jnp.array(IN_TRIANGLE)
+)
+SEGMENTS = jax.jit(segmentation.find_segments, static_argnums=(0, 1))(LIDAR, CONFIG.segments, SCAN)
+WALLS = jax.jit(wall_segments)(SEGMENTS)
 HERE = inverse_transform(jnp.array(IN_TRIANGLE), jnp.array(CENTRE))  # the junction, robot frame
 CELL = np.asarray(cell_of(GRID, HERE[None]))[0]
 
+find_starts = jax.jit(circle_search._starts, static_argnums=(2, 3, 4, 5))
 find = jax.jit(junctions.find_junctions, static_argnums=(0, 1, 2))
 
 
@@ -36,8 +40,8 @@ def marked(*cells):
 
 def starts(cells):
     """Starts of circles from junction cells: their centres (N, 2)."""
-    x, y, _, found = circle_search._starts(
-        cells, wall_segments(SEGMENTS), LEVELS[0], SPEC.num_candidates, SPEC, SCAN.ranges.dtype
+    x, y, _, found = find_starts(
+        cells, WALLS, LEVELS[0], SPEC.num_candidates, SPEC, SCAN.ranges.dtype
     )
     return np.stack([x, y], axis=1)[np.asarray(found)]
 

@@ -17,11 +17,31 @@ SPEC = SegmentSpec()
 SMALL = Lidar(num_beams=61, angle_min=-math.pi / 3, angle_increment=math.pi / 90, range_std=0.01)
 SCANS, COST, MAX_INCIDENCE = 24, SPEC.segment_cost, 10.0
 find_segments = jax.jit(segmentation.find_segments, static_argnums=(0, 1))
+longest_intervals = jax.jit(line_fitting.longest_intervals, static_argnames="capacity")
 cast = jax.jit(ray_casting.cast, static_argnums=0)
 
 
 def angles(scanner):
     return scanner.angle_min + scanner.angle_increment * np.arange(scanner.num_beams)
+
+
+@partial(jax.jit, static_argnums=4)
+@partial(jax.vmap, in_axes=(0, 0, 0, None, None))
+def partitions(ranges, hit, breaks, costs, num_candidates):
+    segment_cost, outlier_cost, max_incidence = costs
+    return line_fitting.partition_beams(
+        SMALL,
+        Scan(ranges, hit),
+        breaks,
+        hit,
+        0.01,
+        segment_cost=segment_cost,
+        outlier_cost=outlier_cost,
+        num_candidates=num_candidates,
+        roughness_std=0.0,
+        roughness_length=1.0,
+        max_incidence=max_incidence,
+    )
 
 
 def partition(
@@ -34,27 +54,14 @@ def partition(
     outlier_cost=SPEC.outlier_cost,
     max_incidence=MAX_INCIDENCE,
 ):
-    """Where segments begin (N, R), of scans of even walls."""
-
-    @jax.jit
-    @jax.vmap
-    def one(ranges, hit, breaks):
-        scan = Scan(ranges, hit)
-        return line_fitting.partition_beams(
-            SMALL,
-            scan,
-            breaks,
-            hit,
-            0.01,
-            segment_cost=segment_cost,
-            outlier_cost=outlier_cost,
-            num_candidates=num_candidates,
-            roughness_std=0.0,
-            roughness_length=1.0,
-            max_incidence=max_incidence,
-        )
-
-    return jax.tree.map(np.asarray, one(*map(jnp.asarray, (ranges, hit, breaks))))
+    """Where segments begin (N, R), of scans of even walls; the last is repeated for the program."""
+    count, costs = len(ranges), jnp.array([segment_cost, outlier_cost, max_incidence])
+    given = [
+        jnp.asarray(np.concatenate([x, np.repeat(x[-1:], SCANS - count, axis=0)]))
+        for x in (ranges, hit, breaks)
+    ]
+    found = partitions(*given, costs, num_candidates)
+    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 
 @pytest.fixture(scope="module")
@@ -151,9 +158,7 @@ def test_segments_begin_at_breaks_and_hold_no_beam_without_return(scans):
     assert begins[breaks].all() and begins[~hit].all()
     assert not begins[hit & ~breaks].all() and begins[hit & ~breaks].any()
     for k in range(SCANS):
-        intervals = line_fitting.longest_intervals(
-            jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40
-        )
+        intervals = longest_intervals(jnp.asarray(begins[k]), jnp.asarray(hit[k]), capacity=40)
         member = np.asarray(intervals.interval_of_beam(SMALL.num_beams)) < 40
         np.testing.assert_array_equal(member, hit[k])
 
@@ -202,7 +207,7 @@ def test_a_scan_without_returns_has_no_segments_and_finite_numbers(ranges):
     parts = partition(nothing.ranges[None], nothing.hit[None], nothing.hit[None])
     assert parts.begins.all() and np.isfinite(parts.normal).all()
     begins = jnp.asarray(parts.begins[0])
-    intervals = line_fitting.longest_intervals(begins, nothing.hit, capacity=5)
+    intervals = longest_intervals(begins, nothing.hit, capacity=5)
     assert intervals.first.tolist() == [NO_BEAM] * 5 and intervals.last.tolist() == [-1] * 5
     found = find_segments(SMALL, SPEC, nothing)
     assert not found.valid.any() and not found.meets_next.any()
@@ -277,12 +282,12 @@ def pairs_of(intervals):
 def test_the_longest_are_kept_in_the_order_of_the_beams():
     begins = jnp.isin(jnp.arange(24), jnp.array([0, 5, 7, 10, 11, 21]))
     hit = jnp.arange(24) < 21
-    kept = line_fitting.longest_intervals(begins, hit, capacity=3)
+    kept = longest_intervals(begins, hit, capacity=3)
     assert pairs_of(kept) == [(0, 4), (7, 9), (11, 20)]
     of = [0] * 5 + [3] * 2 + [1] * 3 + [3] + [2] * 10 + [3] * 3
     np.testing.assert_array_equal(kept.interval_of_beam(24), of)
     np.testing.assert_array_equal(kept.size, [5, 3, 10])
-    more = line_fitting.longest_intervals(begins, hit, capacity=7)
+    more = longest_intervals(begins, hit, capacity=7)
     assert pairs_of(more) == [(0, 4), (5, 6), (7, 9), (10, 10), (11, 20)]
     assert more.first.tolist()[5:] == [NO_BEAM] * 2 and more.last.tolist()[5:] == [-1] * 2
 

@@ -36,6 +36,7 @@ SEED_RADIUS = 2.5 * GRID.cell_size  # [m] cells this close to a junction belong 
 OPENINGS = [(1.6, 3.0), (3.8, 5.2), (6.0, 7.4)]
 COMB = worlds.outline([(-0.5, -1.0, 8.5, 1.0), *[(a, 1.0, b, 3.0) for a, b in OPENINGS]])
 IN_COMB = (0.1, -0.3, 0.1)
+MOST_WALLS = len(worlds.named("office").walls)
 
 
 @jax.jit
@@ -54,7 +55,10 @@ def find(found, diagram, sources, scan):
 
 
 def scene(walls, pose):
-    scan, found, diagram, sources = simulate(jnp.asarray(walls), jnp.asarray(pose))
+    """For one number of walls: those of the office, the last of others many times."""
+    walls = np.asarray(walls)
+    walls = np.concatenate([walls, np.repeat(walls[-1:], MOST_WALLS - len(walls), axis=0)])
+    scan, found, diagram, sources = simulate(jnp.asarray(walls), jnp.asarray(pose, float))
     return found, diagram, sources, scan
 
 

@@ -1,17 +1,19 @@
 """Levels of grids: one is the front end without them, two reach as far as the scan."""
 
 import re
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam.core import se2_np
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import inverse_transform, transform
 from jaxslam.core.types import FAR_JUNCTION, JUNCTION
 from jaxslam.filtering.config import FilterConfig
-from jaxslam.frontend import circle_search, extract, pyramid
+from jaxslam.frontend import circle_search, extract, pyramid, segmentation
 from jaxslam.frontend import junctions as junction_search
 from jaxslam.frontend.circle_fitting import FittedCircles
 from jaxslam.frontend.config import COARSE_LEVEL, PYRAMID, FrontendConfig
@@ -36,13 +38,25 @@ IN_CORRIDOR = (0.5, -1.0, 0.05)
 BAY = worlds.outline([(0.0, -8.0, 30.0, 8.0), (8.0, 8.0, 11.0, 13.0)])
 IN_BAY = (9.0, 4.0, 0.6)
 WORLDS = [(HALL, IN_HALL), (CORRIDOR, IN_CORRIDOR), (BAY, IN_BAY)]
+MOST_WALLS = max(len(walls) for walls, _ in WORLDS)
 
 local_graph = jax.jit(extract.extract_local_graph, static_argnums=0)
 levels_of = jax.jit(extract.extract_levels, static_argnums=0)
 
 
+find_segments = jax.jit(segmentation.find_segments, static_argnums=(0, 1))
+grow = jax.jit(extract.grow, static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=0)
+def cast(lidar, walls, pose):
+    return ray_casting.cast(lidar, World(walls), pose)
+
+
 def scan_of(walls, pose, lidar=LIDAR):
-    return ray_casting.cast(lidar, World(jnp.asarray(walls)), jnp.asarray(pose))
+    """For one number of walls, the last of which may be there many times."""
+    walls = np.concatenate([walls, np.repeat(walls[-1:], MOST_WALLS - len(walls), axis=0)])
+    return cast(lidar, jnp.asarray(walls), jnp.asarray(pose))
 
 
 def junctions(config, walls, pose):
@@ -61,13 +75,13 @@ def test_a_hall_has_its_junctions_with_two_levels_only():
 def test_its_covariance_is_that_of_its_error():
     exact = scan_of(HALL, IN_HALL)
     noise = LIDAR.range_std * jax.random.normal(jax.random.key(0), (64, LIDAR.num_beams))
-    scans = Scan(exact.ranges[None] + noise, jnp.broadcast_to(exact.hit[None], noise.shape))
-    found, _ = extract.extract_local_graphs(TWO, scans)
-    assert np.all(np.asarray(found.valid)[:, 0] & np.asarray(found.trusted)[:, 0])
-    error = np.asarray(transform(jnp.asarray(IN_HALL), found.xy[:, 0])) - [25.0, 10.0]
+    each = [local_graph(TWO, exact._replace(ranges=exact.ranges + n))[0] for n in noise]
+    found = jax.tree.map(lambda *x: np.stack(x), *each)
+    assert np.all(found.valid[:, 0] & found.trusted[:, 0])
+    error = se2_np.transform(np.array(IN_HALL), found.xy[:, 0]) - [25.0, 10.0]
     assert np.abs(error).max() < 0.03
     # What is assumed for rough walls, 2 mm for each foot, is not in these scans.
-    predicted = np.sqrt(np.trace(np.asarray(found.cov)[:, 0], axis1=1, axis2=2)).mean()
+    predicted = np.sqrt(np.trace(found.cov[:, 0], axis1=1, axis2=2)).mean()
     assert 0.3 * predicted < np.sqrt(np.sum(error**2, axis=1).mean()) < 1.5 * predicted
 
 
@@ -79,13 +93,11 @@ def test_a_world_and_a_grid_four_times_as_large_have_the_same_diagram(walls, pos
     small_scan = scan_of(small, near, LIDAR._replace(range_max=10.0))
     np.testing.assert_allclose(4 * small_scan.ranges, large_scan.ranges)
     # The same beams are of the same walls, on either scale.
-    segments = jax.jit(extract.segmentation.find_segments, static_argnums=(0, 1))(
-        TWO.lidar, TWO.segments, large_scan
-    )
+    segments = find_segments(TWO.lidar, TWO.segments, large_scan)
     fine = make_level(GridSpec(x_max=6.4, y_half=6.4, x_min=-0.1), GridSpec(), 3.2, 32)
     coarse = make_level(GridSpec(0.4, 25.6, -0.4, 25.6), GridSpec(), 3.2, 32)
     grown = [
-        extract.grow(config, level._replace(scale=1.0), scan, segments)
+        grow(config, level._replace(scale=1.0), scan, segments)
         for config, level, scan in (
             (TWO._replace(lidar=LIDAR._replace(range_max=10.0)), fine, small_scan),
             (TWO, coarse, large_scan),
@@ -173,14 +185,15 @@ def test_a_circle_that_the_finer_level_holds_is_not_of_the_coarser(kept):
 def test_cells_of_one_far_junction_start_one_circle():
     coarse = TWO.pyramid()[1]
     scan = scan_of(HALL, IN_HALL)
-    walls = wall_segments(extract.segmentation.find_segments(LIDAR, TWO.segments, scan))
+    walls = jax.jit(wall_segments)(find_segments(LIDAR, TWO.segments, scan))
     here = inverse_transform(jnp.asarray(IN_HALL), jnp.array([25.0, 10.0]))
     row, column = np.asarray(cell_of(coarse.grid, here[None]))[0]
     cells = np.zeros(coarse.grid.shape, bool)
     cells[row - 1 : row + 3, column - 1 : column + 3] = True
     assert len(np.unique(np.argwhere(cells) // circle_search.BLOCK, axis=0)) >= 4
     count = TWO.features.max_coarse_candidates
-    x, y, _, found = circle_search._starts(
+    starts = jax.jit(circle_search._starts, static_argnums=(2, 3, 4, 5))
+    x, y, _, found = starts(
         jnp.asarray(cells), walls, coarse, count, TWO.features, scan.ranges.dtype
     )
     assert found.shape == (count,) and found.tolist() == [True] + [False] * (count - 1)

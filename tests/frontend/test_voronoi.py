@@ -7,17 +7,12 @@ import pytest
 import reference
 from scipy.ndimage import distance_transform_cdt
 
-from jaxslam.frontend.automaton import (
-    EMPTY,
-    FROZEN,
-    Diagram,
-    decode,
-    encode_sources,
-    expand,
-    expand_encoded,
-)
-from jaxslam.frontend.voronoi import branch_cells, encoded_junction_cells, junction_cells
+from jaxslam.frontend import automaton, voronoi
+from jaxslam.frontend.automaton import EMPTY, FROZEN, Diagram, decode, expand, expand_encoded
 
+branch_cells, junction_cells = jax.jit(voronoi.branch_cells), jax.jit(voronoi.junction_cells)
+encoded_junction_cells = jax.jit(voronoi.encoded_junction_cells)
+encode_sources = jax.jit(automaton.encode_sources)
 STEPS = 60  # more than any front needs on the grids below
 SEEDS = range(4)
 
@@ -192,7 +187,7 @@ def test_junctions_are_where_three_labels_are_near(seed):
 
 def test_expand_batches():
     bits, free = (np.stack(x) for x in zip(*map(random_grid, SEEDS), strict=True))
-    together = jax.vmap(lambda b, o: expand(b, o, steps=STEPS))(bits, free)
+    together = jax.jit(jax.vmap(lambda b, o: expand(b, o, steps=STEPS)))(bits, free)
     for k in SEEDS:
         alone = grown(bits[k], free[k])
         jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), together, alone)
@@ -202,7 +197,7 @@ def test_expand_batches_in_two_levels_with_free_cells_in_common():
     bits = np.stack([random_grid(seed)[0] for seed in SEEDS])
     free = random_grid(0)[1]
     of_row = jax.vmap(lambda own: expand(own, free, steps=STEPS))
-    together = jax.vmap(of_row)(bits.reshape(2, 2, *free.shape))
+    together = jax.jit(jax.vmap(of_row))(bits.reshape(2, 2, *free.shape))
     for k in SEEDS:
         alone = grown(bits[k], free)
         for a, b in zip(together, alone, strict=True):

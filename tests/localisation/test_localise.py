@@ -141,6 +141,7 @@ def together(place_map, robots):
     return run_all(place_map, *robots)
 
 
+@pytest.mark.slow
 def test_robots_are_found_anywhere_and_tracked(drive, together):
     info = together
     poses = np.stack([beside(drive, start, seed=start)[0] for start in STARTS], axis=1)
@@ -171,6 +172,7 @@ def test_a_batch_is_the_same_as_its_robots_one_after_the_other(place_map, robots
                 np.testing.assert_allclose(of_all[t, k], of_one, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_stays_with_its_robot(place_map, robots, together):
     scans, odometry = robots
     bad = Scan(scans.ranges.at[1, 4].set(jnp.nan), scans.hit.at[1, 4].set(True))

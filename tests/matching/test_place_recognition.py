@@ -45,12 +45,17 @@ def queries(office):
     return poses, scans_of(worlds.named("office"), jnp.asarray(poses), LIDAR.range_std, 7)
 
 
-def queries_of(scans):
-    return jax.vmap(lambda scan: make_query(SPEC, LIDAR, scan, HERE))(
+query_of = jax.jit(make_query, static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=1)
+def queries_of(scans, lidar=LIDAR):
+    return jax.vmap(lambda scan: make_query(SPEC, lidar, scan, HERE))(
         jax.tree.map(lambda x: x[:, None], scans)
     )
 
 
+@jax.jit
 def places_of(index, queries):
     return jax.vmap(partial(find_places, SPEC, index))(queries)
 
@@ -71,7 +76,7 @@ def test_places_are_found_and_none_that_is_accepted_is_wrong(index, queries):
 
 def test_one_query_alone_gives_the_same(index, queries):
     many = places_of(index, queries_of(queries[1]))
-    one = find_places(SPEC, index, make_query(SPEC, LIDAR, item(queries[1], slice(2, 3)), HERE))
+    one = find_places(SPEC, index, query_of(SPEC, LIDAR, item(queries[1], slice(2, 3)), HERE))
     for all_of_them, alone in zip(many, one, strict=True):
         np.testing.assert_allclose(all_of_them[2], alone, atol=1e-6)
 
@@ -89,10 +94,7 @@ def test_a_scanner_with_other_beams_finds_its_place(index, queries):
     other = Lidar(90, -1.2, 2.4 / 89, 12.0, 0.02)
     poses = jnp.asarray(queries[0])
     scans = jax.jit(jax.vmap(partial(ray_casting.cast, other, worlds.named("office"))))(poses)
-    given = jax.vmap(lambda scan: make_query(SPEC, other, scan, HERE))(
-        jax.tree.map(lambda x: x[:, None], scans)
-    )
-    found = places_of(index, given)
+    found = places_of(index, queries_of(scans, other))
     accepted = np.asarray(found.accepted)
     assert accepted.mean() >= 0.4
     assert is_right(found.poses[:, 0], queries[0])[accepted].all()
@@ -100,7 +102,7 @@ def test_a_scanner_with_other_beams_finds_its_place(index, queries):
 
 def test_a_window_of_scans_is_put_together_in_the_frame_of_the_last(office):
     poses, scans = item(office, slice(6, 9))
-    query = make_query(SPEC, LIDAR, scans, relative(poses[-1], poses))
+    query = query_of(SPEC, LIDAR, scans, relative(poses[-1], poses))
     walls = np.asarray(worlds.named("office").walls)
     t = np.linspace(0.0, 1.0, 2000)[:, None, None]
     on_walls = (walls[None, :, :2] * (1 - t) + walls[None, :, 2:] * t).reshape(-1, 2)
@@ -119,9 +121,10 @@ def test_a_symmetric_room_is_ambiguous_rather_than_guessed(length, num_places):
     walls = [(*p, *q) for p, q in zip(corners, corners[1:] + corners[:1], strict=True)]
     turn = Lidar(360, -np.pi, 2 * np.pi / 360, 15.0, 0.0)
     poses = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, 1.0], [-0.6, 0.2, -2.0], [0.2, -0.5, 2.5]])
-    scans = jax.vmap(partial(ray_casting.cast, turn, World(jnp.array(walls))))(jnp.asarray(poses))
+    cast = jax.jit(jax.vmap(partial(ray_casting.cast, turn, World(jnp.array(walls)))))
+    scans = cast(jnp.asarray(poses))
     index = build_index(SPEC, turn, poses, scans)
-    found = find_places(SPEC, index, make_query(SPEC, turn, item(scans, slice(1, 2)), HERE))
+    found = find_places(SPEC, index, query_of(SPEC, turn, item(scans, slice(1, 2)), HERE))
     assert not found.accepted and found.margin < 0.03
     score = np.asarray(found.score)
     assert (score[:num_places] > score[0] - 0.05).all()
@@ -139,14 +142,20 @@ def test_places_of_another_building_are_hardly_ever_accepted(index):
 
 def test_a_scan_without_any_return_is_nowhere(index, queries):
     nothing = jax.tree.map(jnp.zeros_like, item(queries[1], slice(0, 1)))
-    found = find_places(SPEC, index, make_query(SPEC, LIDAR, nothing, HERE))
+    found = find_places(SPEC, index, query_of(SPEC, LIDAR, nothing, HERE))
     assert not found.accepted and np.isfinite(found.poses).all()
 
 
 def test_cells_know_the_nearest_surface(office, index):
     poses, scans = office
-    surfaces = jax.vmap(partial(oriented_points.oriented_points, LIDAR))(scans)
-    surfaces = jax.vmap(oriented_points.transform_points)(jnp.asarray(poses), surfaces)
+
+    @jax.jit
+    @jax.vmap
+    def surface(pose, scan):
+        points = oriented_points.oriented_points(LIDAR, scan)
+        return oriented_points.transform_points(pose, points)
+
+    surfaces = surface(jnp.asarray(poses), scans)
     points = np.asarray(surfaces.points)[np.asarray(surfaces.valid)]
     cells = np.random.default_rng(0).integers(0, index.distance.shape, (500, 2))
     centres = np.asarray(index.origin) + SPEC.cell * cells
@@ -162,9 +171,10 @@ def test_cells_know_the_nearest_surface(office, index):
 
 
 def test_the_score_is_that_of_the_slow_version(index, queries):
-    query = make_query(SPEC, LIDAR, item(queries[1], slice(4, 5)), HERE)
+    query = query_of(SPEC, LIDAR, item(queries[1], slice(4, 5)), HERE)
     pose = np.array([*queries[0][4, :2] + 0.07, queries[0][4, 2]])
-    fast = place_fit.score_pose(SPEC, index, query, jnp.asarray(pose))
+    score_pose = jax.jit(place_fit.score_pose, static_argnums=0)
+    fast = score_pose(SPEC, index, query, jnp.asarray(pose))
 
     def on_wall(point, across=False):
         xy = compose(pose, np.array([*point, 0.0]))[:2] - np.asarray(index.origin)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,8 +8,9 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from simulated_scans import CORRIDOR, LIDAR, item, odometry_of, scans_of
 
+from jaxslam.core import se2_np
 from jaxslam.core.scan import Scan
-from jaxslam.core.se2 import compose, relative, transform
+from jaxslam.core.se2 import compose
 from jaxslam.frontend import lidar
 from jaxslam.matching import fuse_odometry, oriented_points
 from jaxslam.matching.icp import ScanMatchSpec
@@ -15,7 +18,7 @@ from jaxslam.matching.scan_matching import empty_submap, match_scan, match_scans
 from jaxslam.simulation import path_following, worlds
 
 SPEC = ScanMatchSpec(window_scans=8)
-STEPS = 16
+STEPS, CHUNK = 16, 6  # scans of the drive, and of the program that most tests share
 
 
 @pytest.fixture(scope="module")
@@ -31,30 +34,40 @@ def drive():
 
 
 def matches_of(scans, odometry):
-    return match_scans(SPEC, LIDAR, empty_submap(SPEC, LIDAR), scans, odometry)[1]
+    """Matches of all scans, in chunks of one length; after the last the robot stands still."""
+    submap, found = empty_submap(SPEC, LIDAR), []
+    for first in range(0, len(odometry), CHUNK):
+        some, motion = (item(x, slice(first, first + CHUNK)) for x in (scans, odometry))
+        count = len(motion)
+        if more := CHUNK - count:
+            some = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], more, 0)]), some)
+            motion = np.concatenate([motion, np.zeros((more, 3))])
+        submap, matches = match_scans(SPEC, LIDAR, submap, some, motion, count)
+        found.append(item(jax.tree.map(np.asarray, matches), slice(count)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
 def test_increments_of_slipping_wheels_are_corrected(drive):
     poses, scans = drive
-    true = odometry_of(poses)
+    true = np.asarray(odometry_of(poses))
     rng = np.random.default_rng(0)
     slip = np.array([0.05, 0.03, 0.2]) * rng.uniform(-1, 1, true.shape)
     slip[0] = 0.0
     found = matches_of(scans, true + slip)
-    error = np.asarray(jax.vmap(relative)(true, found.increment))
+    error = se2_np.relative(true, found.increment)
     assert np.hypot(*error[:, :2].T).max() < 0.02
     assert np.degrees(np.abs(error[:, 2])).max() < 0.3
     assert np.asarray(found.inlier_fraction)[1:].min() > 0.6
-    by_odometry = np.asarray(jax.vmap(relative)(true, true + slip))
+    by_odometry = se2_np.relative(true, true + slip)
     assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(by_odometry**2))
 
 
 def test_the_information_agrees_with_the_errors(drive):
     """Of many draws of the range noise: the errors lie within what `point_std` = 0.1 m allows."""
     poses, _ = drive
-    pair, true = poses[3:5], odometry_of(poses[3:5])
+    pair, true = poses[3:5], np.asarray(odometry_of(poses[3:5]))
     found = [matches_of(scans_of(worlds.named("office"), pair, 0.01, k), true) for k in range(40)]
-    error = np.stack([relative(true[1], match.increment[1]) for match in found])
+    error = np.stack([se2_np.relative(true[1], match.increment[1]) for match in found])
     information = np.mean([match.information[1] for match in found], axis=0)
     square = np.einsum("ni,ij,nj->n", error, information, error)
     # Independent errors of 1 cm would make it 3 (0.01 / 0.1)^2; it is of that size.
@@ -62,14 +75,18 @@ def test_the_information_agrees_with_the_errors(drive):
     assert np.linalg.eigvalsh(information)[0] > 0.0
 
 
+oriented_points_of = jax.jit(oriented_points.oriented_points, static_argnums=0)
+
+
 def slow_cost(poses, scans, k):
     """Robust cost of the pose of scan k against all points of the scans before, by a k-d tree."""
     clouds, normals = [], []
     for i in range(k):
-        surface = oriented_points.oriented_points(LIDAR, item(scans, i))
+        surface = oriented_points_of(LIDAR, item(scans, i))
         use = np.asarray(surface.valid)
-        clouds.append(np.asarray(transform(poses[i], surface.points))[use])
         c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+        turned = np.asarray(surface.points)[use] @ np.array([[c, s], [-s, c]])
+        clouds.append(turned + poses[i, :2])
         normals.append(np.asarray(surface.normal)[use] @ np.array([[c, s], [-s, c]]))
     trees = [cKDTree(cloud) for cloud in clouds]
     scan = item(scans, k)
@@ -96,12 +113,12 @@ def test_it_ends_where_an_independent_search_does(drive):
     found = matches_of(scans, odometry_of(poses))
     matched = [np.zeros(3)]
     for increment in found.increment[1:]:
-        matched.append(np.asarray(compose(jnp.asarray(matched[-1]), increment)))
-    matched = jnp.asarray(np.array(matched))
+        matched.append(se2_np.compose(matched[-1], increment))
+    matched = np.array(matched)
     for k in (3, 6):
         cost = slow_cost(matched, scans, k)
         best = minimize(cost, matched[k] + np.array([0.01, -0.01, 0.005]), method="Nelder-Mead")
-        off = np.asarray(relative(matched[k], jnp.asarray(best.x)))
+        off = se2_np.relative(matched[k], best.x)
         assert np.hypot(*off[:2]) < 0.006 and abs(off[2]) < 0.003
 
 
@@ -195,11 +212,12 @@ def test_match_scan_refuses_several_scans_and_other_beams():
 
 def test_lists_numpy_and_jax_of_either_precision_give_the_same(drive):
     _, scans = drive
-    scans, odometry = item(jax.tree.map(np.asarray, scans), slice(4)), np.zeros((4, 3))
+    scans, odometry = item(jax.tree.map(np.asarray, scans), slice(CHUNK)), np.zeros((CHUNK, 3))
     scans = scans._replace(ranges=scans.ranges.astype(np.float32).astype(float))
-    expected = matches_of(scans, odometry)
+    match = partial(match_scans, SPEC, LIDAR, empty_submap(SPEC, LIDAR))
+    _, expected = match(scans, odometry, CHUNK)
     to_list = Scan(scans.ranges.tolist(), scans.hit.tolist())
     single = scans._replace(ranges=scans.ranges.astype(np.float32))
     for given in (to_list, single, jax.tree.map(jnp.asarray, single)):
-        found = matches_of(given, odometry.astype(int).tolist())
+        _, found = match(given, odometry.astype(int).tolist(), CHUNK)
         jax.tree.map(np.testing.assert_array_equal, found, expected)

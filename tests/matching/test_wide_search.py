@@ -5,7 +5,8 @@ import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 from simulated_scans import CORRIDOR, LIDAR, odometry_of, scans_of
 
-from jaxslam.core.se2 import compose, relative, transform
+from jaxslam.core import se2_np
+from jaxslam.core.se2 import compose, transform
 from jaxslam.frontend import lidar
 from jaxslam.matching import motion_prior, oriented_points, wide_search
 from jaxslam.matching.icp import ScanMatchSpec
@@ -15,6 +16,8 @@ from jaxslam.simulation import path_following, worlds
 
 SPEC = ScanMatchSpec(window_scans=8)
 SCANS_ONLY = SPEC._replace(use_odometry=False)
+STEPS = 30
+wheel_motion = jax.jit(motion_prior.wheel_motion, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +25,7 @@ def drive():
     """A quarter of a metre a scan through the office, where it turns as well."""
     path = path_following.densify(worlds.waypoints("office"))
     along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    driven = 8.0 + 0.25 * np.arange(30)
+    driven = 8.0 + 0.25 * np.arange(STEPS)
     x, y = (np.interp(driven, along, column) for column in path.T)
     ahead = [np.interp(driven + 0.3, along, column) for column in path.T]
     poses = jnp.stack([x, y, np.arctan2(ahead[1] - y, ahead[0] - x)], axis=1)
@@ -30,14 +33,19 @@ def drive():
 
 
 def matches_of(spec, scans, odometry, start=None):
-    submap = empty_submap(spec, LIDAR)
+    """Matches of all scans, after which the robot stands still, for one length of all drives."""
+    submap, count = empty_submap(spec, LIDAR), len(odometry)
     if start is not None:
         submap = submap._replace(last_pose=start)
-    return match_scans(spec, LIDAR, submap, scans, odometry)[1]
+    if more := STEPS - count:
+        scans = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)]), scans)
+        odometry = np.concatenate([odometry, np.zeros((more, 3))])
+    _, found = match_scans(spec, LIDAR, submap, scans, odometry, count)
+    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 
 def errors_of(poses, found):
-    error = np.asarray(jax.vmap(relative)(odometry_of(poses), found.increment))
+    error = se2_np.relative(np.asarray(odometry_of(poses)), found.increment)
     return np.hypot(*error[:, :2].T).max(), np.abs(error[:, 2]).max()
 
 
@@ -47,7 +55,7 @@ def latched(odometry):
     for k in (8, 19):
         whole = np.zeros(3)
         for step in hurt[k : k + 4]:
-            whole = np.asarray(compose(jnp.asarray(whole), jnp.asarray(step)))
+            whole = se2_np.compose(whole, step)
         hurt[k : k + 4] = 0.0
         hurt[k + 3] = whole
     return jnp.asarray(hurt)
@@ -110,11 +118,14 @@ def test_equal_places_are_ambiguous_rather_than_guessed():
     np.testing.assert_allclose(found[1, 1], 1e6, rtol=1e-6)
 
 
-def next_history(history, step, contradicted=False, wheels=None):
-    wheels = step if wheels is None else wheels
+@jax.jit
+def following(history, step, wheels, contradicted):
     wheels = motion_prior.wheel_motion(SPEC, history, wheels, jnp.array(False))
-    ones = jnp.ones(())
-    return motion_prior.next_history(history, wheels, step, ones, jnp.asarray(contradicted))
+    return motion_prior.next_history(history, wheels, step, jnp.ones(()), contradicted)
+
+
+def next_history(history, step, contradicted=False, wheels=None):
+    return following(history, step, step if wheels is None else wheels, jnp.array(contradicted))
 
 
 def history_of(increment, count=40, contradicted=False):
@@ -210,14 +221,27 @@ def test_wheels_leap_where_the_motion_changes_by_more_than_is_usual():
     assert not motion_prior.wrong_again(SPEC, wrong_of_late, right)
 
 
+@pytest.fixture(scope="module")
+def counted_search():
+    """The search, jitted, and a list with an item for each that has looked widely."""
+    searches, candidates = [], wide_search._candidates
+
+    def counted(*given):
+        jax.debug.callback(lambda: searches.append(1))
+        return candidates(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wide_search, "_candidates", counted)
+        yield jax.jit(wide_search.search_widely, static_argnums=(0, 1)), searches
+
+
 @pytest.mark.parametrize("right", [True, False])
 def test_a_quick_match_that_the_motion_before_does_not_better_is_kept_without_a_search(
-    drive, monkeypatch, right
+    drive, counted_search, right
 ):
     poses, scans = drive
     submap, now = empty_submap(SPEC, LIDAR), 8
-    first = jax.tree.map(lambda x: x[:now], scans)
-    submap, _ = match_scans(SPEC, LIDAR, submap, first, odometry_of(poses)[:now])
+    submap, _ = match_scans(SPEC, LIDAR, submap, scans, odometry_of(poses), now)
     step = odometry_of(poses)[now]
     true = compose(submap.last_pose, step)
     wheels = motion_prior.WheelMotion(step, 0.01 * jnp.ones(3), jnp.zeros(()))
@@ -226,15 +250,10 @@ def test_a_quick_match_that_the_motion_before_does_not_better_is_kept_without_a_
     points, hit = lidar.beam_ends(LIDAR, scan), scan.hit
     pose = true if right else true.at[:2].add(0.7)
     quick = MatchedPose(pose, 1e4 * jnp.eye(3), jnp.where(right, 0.95, 0.5))
-    searches = []
-    candidates = wide_search._candidates
-    monkeypatch.setattr(
-        wide_search,
-        "_candidates",
-        lambda *given: (jax.debug.callback(lambda: searches.append(1)), candidates(*given))[1],
-    )
+    search, searches = counted_search
+    searches.clear()
     given = SPEC, LIDAR, submap, hypotheses, points, hit, quick
-    found = wide_search.search_widely(*given, jnp.array(True))
+    found = search(*given, jnp.array(True))
     jax.effects_barrier()
     assert len(searches) == (0 if right else 1)
     np.testing.assert_allclose(found.pose, true, atol=0.03)
@@ -260,19 +279,26 @@ def slow_contradicted(lidar, clouds, poses, points):
 
 def test_contradicted_are_points_in_space_that_keyframes_saw_to_be_free(drive):
     poses, scans = (jax.tree.map(lambda x: x[:3], part) for part in drive)
-    surfaces = jax.vmap(lambda s: oriented_points.oriented_points(LIDAR, s))(scans)
-    surfaces = jax.vmap(oriented_points.transform_points)(poses, surfaces)
+
+    @jax.jit
+    @jax.vmap
+    def seen(pose, scan):
+        surface = oriented_points.oriented_points(LIDAR, scan)
+        ends = transform(pose, lidar.beam_ends(LIDAR, scan))
+        return oriented_points.transform_points(pose, surface), ends
+
+    surfaces, ends = seen(poses, scans)
     surfaces = surfaces._replace(valid=jnp.ones_like(surfaces.valid))
-    ends = jax.vmap(lambda s: lidar.beam_ends(LIDAR, s))(scans)
-    points = np.array(transform(poses[1], ends[1, ::5]))
+    points = np.array(ends[1, ::5])
     points[::3] = np.asarray(poses[1])[:2] + 0.5 * (points[::3] - np.asarray(poses[1])[:2])
     hit = jnp.ones(len(points), bool)
-    found = wide_search.contradicted_fraction(LIDAR, surfaces, poses, jnp.asarray(points), hit)
+    contradicted_fraction = jax.jit(wide_search.contradicted_fraction, static_argnums=0)
+    found = contradicted_fraction(LIDAR, surfaces, poses, jnp.asarray(points), hit)
     clouds = np.asarray(surfaces.points)
     expected = slow_contradicted(LIDAR, clouds, np.asarray(poses), points)
     np.testing.assert_allclose(found, expected, atol=0.02)
     assert 0.15 < expected < 0.5
-    ahead = wide_search.contradicted_fraction(
+    ahead = contradicted_fraction(
         LIDAR, surfaces, poses, jnp.asarray(points), jnp.arange(len(points)) % 3 != 0
     )
     assert ahead < 0.02
@@ -287,7 +313,7 @@ def test_the_scale_of_the_wheels_is_learned_where_scans_show_the_motion_ahead():
     for _ in range(600):
         said = jnp.array([rng.uniform(0.1, 0.8), 0.0, rng.normal() * 0.1])
         moved = jnp.array([0.95 * said[0] + rng.normal() * 0.02, 0.0, said[2]])
-        wheels = motion_prior.wheel_motion(SPEC, history, said, jnp.array(False))
+        wheels = wheel_motion(SPEC, history, said, jnp.array(False))
         before = history.increment
         history = step(history, wheels, moved, jnp.asarray(information), jnp.array(True))
         history = history._replace(increment=moved)
@@ -329,9 +355,7 @@ def test_noise_of_the_wheels_does_not_bias_their_scale():
     step = jax.jit(motion_prior.learn_scale)
     true = 0.03 + 0.005 * np.sin(np.arange(8000) / 50)
     for moved, said in zip(true, true + rng.normal(size=len(true)) * 0.01, strict=True):
-        wheels = motion_prior.wheel_motion(
-            SPEC, history, jnp.array([said, 0.0, 0.0]), jnp.array(False)
-        )
+        wheels = wheel_motion(SPEC, history, jnp.array([said, 0.0, 0.0]), jnp.array(False))
         moved = jnp.array([moved, 0.0, 0.0])
         history = step(history, wheels, moved, information, jnp.array(True))
         history = history._replace(increment=moved)

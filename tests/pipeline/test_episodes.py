@@ -249,6 +249,7 @@ def test_padding_changes_nothing_of_a_drive(pair):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing_where_all_poses_are_known(pair):
     (short, long), _ = pair
     both = episodes.stack_episodes([short._replace(truth_mask=None), long])

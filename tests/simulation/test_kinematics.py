@@ -1,9 +1,11 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.core import se2, se2_np
+from jaxslam.core import se2_np
 from jaxslam.core.calibration import Calibration, calibrate_odometry
 from jaxslam.filtering import motion_model
 from jaxslam.filtering.noise import NoiseParams
@@ -29,6 +31,9 @@ OFFICE = np.asarray(densify(worlds.waypoints("office")))
 DRAWS, STANDARD_ERRORS = 20_000, 5
 
 drive = jax.jit(drives.drive, static_argnames=("robot", "num_scans"))
+jit_arc, next_motion = jax.jit(arc_increment), jax.jit(kinematics.next_motion, static_argnums=0)
+odometry_cov = jax.jit(motion_model.odometry_cov)
+odometry_rate_cov = jax.jit(motion_model.odometry_rate_cov)
 
 
 def driven(robot, path=PATH, num_scans=60, seed=0):
@@ -37,11 +42,19 @@ def driven(robot, path=PATH, num_scans=60, seed=0):
     return [np.asarray(x) for x in found]
 
 
+true_motion = jax.jit(kinematics.true_motion, static_argnums=0, static_argnames="part")
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def samples(robot, motion, steps):
+    draws = jax.random.normal(jax.random.key(0), (DRAWS, steps, kinematics.num_draws(robot)))
+    exact = kinematics.true_motion(robot, jnp.zeros_like(draws[0]), motion)
+    return exact, jax.vmap(lambda draw: kinematics.true_motion(robot, draw, motion))(draws)
+
+
 def sample(robot, motion, steps=20):
     """True motions (DRAWS, 3) when odometry reports `motion`, without and with noise."""
-    draws = jax.random.normal(jax.random.key(0), (DRAWS, steps, kinematics.num_draws(robot)))
-    true = jax.jit(lambda draw: kinematics.true_motion(robot, draw, motion))
-    return np.asarray(true(jnp.zeros_like(draws[0]))), np.asarray(jax.vmap(true)(draws))
+    return [np.asarray(x) for x in samples(robot, motion, steps)]
 
 
 def spread(cov):
@@ -49,19 +62,24 @@ def spread(cov):
     return np.sqrt((np.outer(np.diag(cov), np.diag(cov)) + cov**2) / DRAWS)
 
 
+def arc(distance, turn):
+    """Motion (3,) along an arc."""
+    return jit_arc(jnp.array(distance), jnp.array(turn))
+
+
 def process_noise(robot, motion):
     """Q (3, 3) that the filter assumes."""
     params = kinematics.noise_params(robot)
-    cov = motion_model.odometry_cov(params.odometry_coefficients, motion)
+    cov = np.asarray(odometry_cov(params.odometry_coefficients, motion))
     if params.odometry_cov_rate is not None:
-        cov += motion_model.odometry_rate_cov(params.odometry_cov_rate, motion)
-    return np.asarray(cov)
+        cov = cov + np.asarray(odometry_rate_cov(params.odometry_cov_rate, motion))
+    return cov
 
 
 @pytest.mark.parametrize("robot", [CAR, OMNI, CART], ids=lambda robot: robot.kinematics)
 def test_odometry_without_noise_composes_to_the_true_poses(robot):
     truth, odometry = driven(robot._replace(**{k: QUIET[k] for k in QUIET}))
-    found = se2.dead_reckoning(jnp.asarray(truth[0]), jnp.asarray(odometry))
+    found = se2_np.dead_reckoning(truth[0], odometry)
     np.testing.assert_allclose(se2_np.increments(truth), se2_np.increments(found), atol=1e-12)
     assert np.linalg.norm(truth[-1, :2] - truth[0, :2]) > 4.0
     noisy, same = driven(robot)
@@ -72,16 +90,12 @@ def test_odometry_without_noise_composes_to_the_true_poses(robot):
 @pytest.mark.parametrize("share", [0.25, 0.6])
 def test_a_first_part_of_a_motion_is_on_its_curve(robot, share):
     """Driving a part and then the rest, each at constant velocities, is the whole motion."""
-    motion = (
-        jnp.array([0.2, 0.05, 0.3])
-        if robot is OMNI
-        else arc_increment(jnp.array(0.3), jnp.array(0.25))
-    )
+    motion = jnp.array([0.2, 0.05, 0.3]) if robot is OMNI else arc(0.3, 0.25)
     rest = jnp.zeros((20, kinematics.num_draws(robot)))
-    first = kinematics.true_motion(robot, rest, motion, part=share)
-    whole = kinematics.true_motion(robot, rest, motion)
+    first = np.asarray(true_motion(robot, rest, motion, part=share))
+    whole = np.asarray(true_motion(robot, rest, motion))
     np.testing.assert_allclose(whole, motion, atol=1e-12)
-    second = se2.relative(first, whole)
+    second = se2_np.relative(first, whole)
     np.testing.assert_allclose(first[2] / whole[2], share, atol=1e-12)
     np.testing.assert_allclose(
         np.linalg.norm(first[:2]) / np.sinc(first[2] / 2 / np.pi) / share,
@@ -113,7 +127,7 @@ def test_the_covariance_of_a_motion_is_that_of_the_filter(robot, motion):
 def test_noise_of_a_car_is_bounded_by_the_filters_and_equal_at_full_lock(bend):
     """Of the turn, on circles from straight on to the smallest one; left and right alike."""
     distance, turn = 0.1, 0.1 * bend / RADIUS
-    motion = arc_increment(jnp.array(distance), jnp.array(turn))
+    motion = arc(distance, turn)
     tan = CAR.wheel_base * bend / RADIUS
     _, true = sample(CAR, motion)
     exact = distance * (
@@ -131,7 +145,7 @@ def test_noise_of_a_car_is_bounded_by_the_filters_and_equal_at_full_lock(bend):
 
 @pytest.mark.parametrize("robot", [CAR, OMNI], ids=lambda robot: robot.kinematics)
 def test_noise_does_not_depend_on_the_number_of_parts(robot):
-    motion = arc_increment(jnp.array(0.2), jnp.array(0.1))
+    motion = arc(0.2, 0.1)
     few, many = (np.cov(sample(robot, motion, steps)[1].T) for steps in (4, 40))
     # The parts of a curve are straight in the mean of the noise, not in each draw.
     assert np.all(np.abs(few - many) < STANDARD_ERRORS * np.sqrt(2) * spread(many) + 1e-7)
@@ -251,10 +265,10 @@ def test_the_true_calibration_makes_odometry_exact(robot, late):
 def test_a_steering_offset_turns_a_car_and_has_no_calibration():
     robot = CAR._replace(**QUIET, steering_offset=0.05)
     rest = jnp.zeros((4, 2))
-    ahead = kinematics.true_motion(robot, rest, jnp.array([0.2, 0.0, 0.0]))
+    ahead = true_motion(robot, rest, jnp.array([0.2, 0.0, 0.0]))
     assert ahead[2] == pytest.approx(0.2 * np.tan(0.05) / CAR.wheel_base)
     read = np.arctan(CAR.wheel_base * 0.1 / 0.2)
-    bent = kinematics.true_motion(robot, rest, arc_increment(jnp.array(0.2), jnp.array(0.1)))
+    bent = true_motion(robot, rest, arc(0.2, 0.1))
     assert bent[2] == pytest.approx(0.2 * np.tan(read + 0.05) / CAR.wheel_base)
     with pytest.raises(ValueError, match="robot.steering_offset is 0.05: it has no calibration"):
         robot.calibration()
@@ -266,8 +280,7 @@ def test_odometry_of_a_rate_is_that_of_its_samples(rate):
     robot = OMNI._replace(**QUIET, scan_period=0.25)
     _, exact = driven(robot)
     truth, odometry = driven(robot._replace(odometry_rate=rate))
-    reckoned = np.asarray(se2.dead_reckoning(jnp.zeros(3), jnp.asarray(odometry)))
-    whole = np.asarray(se2.dead_reckoning(jnp.zeros(3), jnp.asarray(exact)))
+    reckoned, whole = (se2_np.dead_reckoning(np.zeros(3), x) for x in (odometry, exact))
     every = rate * robot.scan_period
     at_samples = [k for k in range(len(whole)) if abs(k * every - round(k * every)) < 1e-9]
     assert len(at_samples) > 4
@@ -290,7 +303,7 @@ def test_speed_and_rate_give_the_motion_between_scans(robot):
 @pytest.mark.parametrize("robot", [CART, OMNI], ids=lambda robot: robot.kinematics)
 def test_a_robot_turns_around_at_its_turn_rate(robot):
     slow = robot._replace(max_turn_rate=0.9, scan_period=0.1)
-    motion, _ = kinematics.next_motion(slow, PATH, jnp.int32(0), jnp.array([1.0, 0.9, 2.5]))
+    motion, _ = next_motion(slow, PATH, jnp.int32(0), jnp.array([1.0, 0.9, 2.5]))
     assert motion[2] == pytest.approx(-0.09)
 
 
@@ -307,7 +320,7 @@ def test_gradients_are_finite_at_rest(robot):
     rest, draws = jnp.zeros(3), jnp.ones((4, kinematics.num_draws(robot)))
     found = jax.jit(jax.jacrev(lambda motion: kinematics.true_motion(robot, draws, motion)))(rest)
     assert np.isfinite(found).all()
-    np.testing.assert_array_equal(kinematics.true_motion(robot, draws, rest), rest)
+    np.testing.assert_array_equal(true_motion(robot, draws, rest), rest)
 
 
 @pytest.mark.parametrize(

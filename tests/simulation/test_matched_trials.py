@@ -49,6 +49,7 @@ def turns_off(found, truth):
     return np.abs((gap + np.pi) % (2 * np.pi) - np.pi).max()
 
 
+@pytest.mark.slow
 def test_scans_show_the_turns_that_the_wheels_miss(drives):
     assert turns_off(drives.odometry, drives.truth) > 0.2
     assert turns_off(drives.scan_matches.increment, drives.truth) < 0.03

@@ -14,6 +14,7 @@ LIDAR = Lidar(num_beams=40, angle_min=0.0, angle_increment=0.02, range_max=12.0,
 DISTANCE = jnp.linspace(0.5, 10.0, 40)
 INCIDENCE = jnp.linspace(0.0, 1.4, 40)
 COUNT = 4000
+jit_mix_edges = jax.jit(mix_edges, static_argnums=1)
 
 
 def returns_of(distance=DISTANCE, surface=None, is_black=False):
@@ -45,13 +46,15 @@ def test_ranges_are_whole_steps_and_the_derivative_of_rounding_is_one():
     exact = np.asarray(scans(RangeErrors(), 50, returns_of()).ranges)
     assert np.abs(found - exact).max() <= 0.025 + 1e-9
 
-    def total(std, resolution):
+    @jax.jit
+    @jax.grad
+    def slope_of(std, resolution):
         own = RangeErrors(std_per_range=std, resolution=resolution)
         return measure(jax.random.key(1), LIDAR, own, returns_of()).ranges.sum()
 
-    slope = jax.grad(total)(0.01, 0.05)
+    slope = slope_of(0.01, 0.05)
     assert abs(slope) > 1.0
-    np.testing.assert_allclose(slope, jax.grad(total)(0.01, 0.0))
+    np.testing.assert_allclose(slope, slope_of(0.01, 0.0))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
@@ -79,7 +82,8 @@ def test_a_spot_that_covers_an_edge_gets_the_mean_over_it():
     given = returns_of(near_far, np.arange(40) >= 20)
     spot = 0.03  # wider than half an increment: now and then both beams beside the edge cover it
     keys = jax.random.split(jax.random.key(3), 4000)
-    found = np.asarray(jax.vmap(lambda key: mix_edges(key, LIDAR, spot, given))(keys))
+    mixed = jax.jit(jax.vmap(lambda key: mix_edges(key, LIDAR, spot, given)))
+    found = np.asarray(mixed(keys))
     np.testing.assert_array_equal(found[:, :19], 2.0)
     np.testing.assert_array_equal(found[:, 21:], 5.0)
     rng = np.random.default_rng(0)
@@ -105,13 +109,15 @@ def test_no_edge_no_spot_and_no_return_change_nothing():
         (0.0, returns_of(surface=split)),
         (0.03, returns_of(np.where(split, np.inf, 2.0), split)),
     ):
-        found = mix_edges(jax.random.key(0), LIDAR, spot, given)
+        found = jit_mix_edges(jax.random.key(0), LIDAR, spot, given)
         np.testing.assert_array_equal(found, given.distance)
     with jax.debug_nans(True):
-        slope = jax.grad(
-            lambda spot: jnp.where(
-                split, 0.0, mix_edges(jax.random.key(0), LIDAR, spot, given)
-            ).sum()
+        slope = jax.jit(
+            jax.grad(
+                lambda spot: jnp.where(
+                    split, 0.0, mix_edges(jax.random.key(0), LIDAR, spot, given)
+                ).sum()
+            )
         )(0.03)
     assert slope == 0.0
 

@@ -1,5 +1,7 @@
 """People, doors and furniture that move while the robot drives."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +18,26 @@ FAR = jnp.array([100.0, 100.0])
 TIMES = jnp.arange(0.0, 400.0, 0.5)
 
 
+@partial(jax.jit, static_argnames="slots")
 def crowd_of(traffic, slots=30, seed=0):
     return make_crowd(jax.random.key(seed), traffic, MOVERS._replace(people=np.arange(slots)))
 
 
+@jax.jit
+def people_over_time(crowd, traffic, scanner):
+    return jax.vmap(lambda t: people_at(crowd, traffic, MOVERS, t, scanner)[0])(TIMES)
+
+
+@jax.jit
+def doors_over_time(crowd, traffic, scanner):
+    return jax.vmap(lambda t: moved_walls(crowd, traffic, MOVERS, t, scanner)[:2])(
+        jnp.arange(0.0, 600.0, 10.0)
+    )
+
+
 def centres_of(traffic, scanner=FAR):
     crowd = crowd_of(traffic)
-    at = jax.jit(jax.vmap(lambda t: people_at(crowd, traffic, MOVERS, t, scanner)[0]))
-    return np.asarray(at(TIMES)), np.asarray(crowd.radius)
+    return np.asarray(people_over_time(crowd, traffic, scanner)), np.asarray(crowd.radius)
 
 
 def distance_to_walkway(points):
@@ -80,10 +94,8 @@ def test_doors_are_closed_for_their_share_of_the_time_and_open_before_the_robot(
 
     def is_closed(seed, scanner):
         crowd = crowd_of(traffic, 1, seed)
-        walls = jax.vmap(lambda t: moved_walls(crowd, traffic, MOVERS, t, scanner)[:2])(
-            jnp.arange(0.0, 600.0, 10.0)
-        )
-        return np.linalg.norm(np.asarray(walls[..., 2:] - walls[..., :2]), axis=-1) > 0.0
+        walls = np.asarray(doors_over_time(crowd, traffic, scanner))
+        return np.linalg.norm(walls[..., 2:] - walls[..., :2], axis=-1) > 0.0
 
     states = np.stack([is_closed(seed, FAR) for seed in range(40)])
     for door in range(2):
@@ -97,7 +109,8 @@ def test_doors_are_closed_for_their_share_of_the_time_and_open_before_the_robot(
 def test_furniture_is_moved_once_and_a_world_may_have_nothing_that_moves():
     traffic = Traffic(moved_at=20.0)
     crowd = crowd_of(traffic, 1)
-    before, after = (moved_walls(crowd, traffic, MOVERS, t, FAR)[2:] for t in (19.9, 20.0))
+    moved = jax.jit(moved_walls)
+    before, after = (moved(crowd, traffic, MOVERS, t, FAR)[2:] for t in (19.9, 20.0))
     np.testing.assert_array_equal(before, CHAIR)
     np.testing.assert_array_equal(after, CHAIR + 2.0)
     none = np.zeros((0, 4))

@@ -106,6 +106,7 @@ def mapped():
     return list(trials.run_trials_and_map(KEY, *SETTING, num_trials=9, num_scans=STEPS))
 
 
+@pytest.mark.slow
 def test_what_a_map_is_made_of_is_that_of_the_first_trial_of_each_part(nine, mapped):
     whole = episodes.concatenate_results(nine)
     assert_same(episodes.concatenate_results(results for results, _ in mapped), whole)
@@ -117,6 +118,7 @@ def test_what_a_map_is_made_of_is_that_of_the_first_trial_of_each_part(nine, map
         first += len(results.truth)
 
 
+@pytest.mark.slow
 def test_the_map_of_a_trial_has_landmarks_of_its_filter_and_the_rooms_walls(mapped):
     _, drive_ = mapped[0]
     result = slam_result(CONFIG, drive_)
@@ -134,6 +136,7 @@ def test_the_map_of_a_trial_has_landmarks_of_its_filter_and_the_rooms_walls(mapp
     assert np.hypot(*(points[:, None] - nearest).T).min(axis=0).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_map_of_the_arcs_of_single_scans_needs_a_replay(mapped):
     merged = CONFIG._replace(mapping=MappingSpec("merged"))
     with pytest.raises(ValueError, match="config.mapping.topology is 'merged', not 'grid'; replay"):

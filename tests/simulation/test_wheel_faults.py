@@ -8,17 +8,17 @@ from scipy import stats
 
 from jaxslam.simulation import wheel_faults
 from jaxslam.simulation.path_following import densify
-from jaxslam.simulation.wheel_faults import (
-    WheelFaults,
-    carry,
-    draw_faults,
-    fail_odometry,
-    keeps_scan,
-    slipped,
-)
+from jaxslam.simulation.wheel_faults import WheelFaults
 
 T = 2000
 ODOMETRY = jnp.asarray(np.random.default_rng(0).normal(size=(T, 3)))
+carry, fail_odometry, slipped = map(
+    jax.jit, (wheel_faults.carry, wheel_faults.fail_odometry, wheel_faults.slipped)
+)
+draw_faults, keeps_scan = (
+    jax.jit(draw, static_argnums=(2, 3))
+    for draw in (wheel_faults.draw_faults, wheel_faults.keeps_scan)
+)
 POSE, MOTION = jnp.array([0.3, 0.4, 0.1]), jnp.array([0.4, 0.0, 0.1])
 
 

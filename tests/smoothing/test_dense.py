@@ -96,6 +96,7 @@ def padded(problem, poses, positions):
     return problem, add(poses, np.tile(poses[-1:] + 0.1, (2, 1))), add(positions, fill(1.0, 2, 2))
 
 
+@jax.jit
 def smooth_function(result):
     """A smooth function of a result: headings and directions count by their sines."""
     total = jnp.sum(result.poses[:T, :2] ** 2) + jnp.sum(jnp.sin(result.poses[:T, 2]))

@@ -1,5 +1,6 @@
 """Calibration of wheels, mount and clocks by scan matching: laws, references, statistics."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def test_motion_of_the_wheels_is_that_of_their_poses():
     np.testing.assert_allclose(found, wanted, atol=1e-9)
     on_device = type(spans)._make(map(jnp.asarray, spans))
     identity = Calibration._make(map(jnp.asarray, Calibration.identity()))
-    same = odometry_calibration.wheel_motion(identity, on_device)
+    same = jax.jit(odometry_calibration.wheel_motion)(identity, on_device)
     np.testing.assert_allclose(same, wanted, atol=1e-9)
 
 

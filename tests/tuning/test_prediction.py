@@ -186,7 +186,7 @@ def test_a_forgotten_landmark_is_a_new_one(robot):
     drive, ids = robot
     renamed = np.where((ids == 0) & (np.arange(ROBOT_STEPS) > 8)[:, None], 3, ids)
     model = run_twice(fitting.as_model(CONFIG), ClosureNll(5))
-    _, info = run_model(model, NOISE, jax.tree.map(jnp.asarray, drive(ids)))
+    _, info = jax.jit(partial(run_model, model))(NOISE, jax.tree.map(jnp.asarray, drive(ids)))
     for expected, found in ((ids, info.whole), (renamed, info.part)):
         episode = drive(expected)
         start = init(CONFIG.filter, jnp.zeros(3))

@@ -5,6 +5,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -55,6 +56,33 @@ share_contexts()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+# Files whose programs are the same, so that one worker runs them: it compiles them once.
+SAME_PROGRAMS = (
+    [
+        f"tests/pipeline/test_{x}.py"
+        for x in ("sessions", "pieces", "reclosing", "self_calibration")
+    ],
+    [f"tests/cli/test_{x}.py" for x in ("run_logs", "calibrated_logs")],
+)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each file to one worker, and those with the same programs to the same one."""
+    from xdist.scheduler import LoadFileScheduling
+
+    if config.getoption("dist") != "loadfile":
+        return None
+    leader = {file: files[0] for files in SAME_PROGRAMS for file in files}
+
+    class Scheduler(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return leader.get(file, file)
+
+    return Scheduler(config, log)
 
 
 def pytest_unconfigure() -> None:

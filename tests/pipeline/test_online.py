@@ -387,7 +387,6 @@ def compiled(caplog, run):
     return re.findall(r"Compiling jit\((\w+)\)", caplog.text)
 
 
-@pytest.mark.slow
 def test_a_log_of_another_length_needs_no_other_program(drive, results, caplog):
     odometry, scans = jax.tree.map(lambda x: x[:6], drive)
     names = compiled(caplog, lambda: online_slam((odometry, scans)))
@@ -395,9 +394,12 @@ def test_a_log_of_another_length_needs_no_other_program(drive, results, caplog):
     config = CONFIG._replace(keyframe_distance=KEYFRAME_DISTANCE)
     names = compiled(caplog, lambda: offline.run_slam(config, PARAMS, *drive, smooth=False))
     assert not {"extract_local_graphs", "match_scans", "_steps", "_init"} & set(names)
-    one = jax.tree.map(lambda x: jnp.asarray(x[:1]), scans)
-    names = compiled(caplog, lambda: extract.extract_local_graphs(CONFIG.frontend, one))
-    assert "extract_local_graphs" in names  # what is compiled is heard of
+
+    def small_program(x):
+        return x + 1.0
+
+    # What is compiled is heard of.
+    assert "small_program" in compiled(caplog, lambda: jax.jit(small_program)(jnp.zeros(7)))
 
 
 def test_another_loop_closure_compiles_no_other_stage(drive, caplog, monkeypatch):

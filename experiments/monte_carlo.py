@@ -157,7 +157,6 @@ def compute(
 ) -> common.Numbers | None:
     """Errors of B trials on all devices of a group of processes; None where process 0 is not."""
     if group is None:
-        use_cpu_devices()
         return work(case, seed, num_trials, folder, sys.stderr)
     results = processes.run_group(group, work, runner.in_numpy(case), seed, num_trials, folder)
     if 0 not in group.own:
@@ -184,6 +183,8 @@ def main(argv: list[str] | None = None) -> int:
         raise InputError("is not positive", field="--runs")
     given = args.processes, args.coordinator_address, args.num_processes, args.process_id
     group = processes.group_of(*given, names=GROUP_FLAGS)
+    if group is None:
+        use_cpu_devices()  # before the first array, which fixes the devices
     case = office()
     if args.replay >= 0:
         found = replay(case, args.seed, args.replay)

@@ -123,6 +123,19 @@ class Stop(Exception):
 
 
 @pytest.mark.slow
+def test_each_core_is_a_device_before_the_first_array_fixes_them(tmp_path, monkeypatch):
+    order = []
+
+    def stop():
+        order.append("arrays")
+        raise InputError("stopped")
+
+    monkeypatch.setattr(monte_carlo, "use_cpu_devices", lambda: order.append("devices"))
+    monkeypatch.setattr(monte_carlo, "office", stop)
+    assert monte_carlo.main(["--out", str(tmp_path)]) == 2
+    assert order == ["devices", "arrays"]
+
+
 def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_path, monkeypatch):
     """Stopped after the first file, as kill -9 would: a part of the next one is left."""
     folder = tmp_path / "runs"

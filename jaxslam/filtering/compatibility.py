@@ -77,7 +77,7 @@ def jointly_compatible(
             remove the match without which D^2 is smallest                 (at most `rounds` times)
         remove those that `review` does not keep
 
-    Which one that is, follows without further inversions: let W = S^-1 and u = W v. Split into
+    The match to remove is found without further inversions: let W = S^-1 and u = W v. Split into
     match k (two rows) and the others, o. The inverse of a block of S is a Schur complement in W,
 
         S_oo^-1 = W_oo - W_ok W_kk^-1 W_ko
@@ -86,7 +86,7 @@ def jointly_compatible(
 
         D^2 without k = D^2 - u_k^T W_kk^-1 u_k
 
-    The match to remove is that of the largest u_k^T W_kk^-1 u_k. Most scans pass at once, so the
+    It is that of the largest u_k^T W_kk^-1 u_k. Most scans pass at once, so the
     loop turns once for most batches, and its factor of S is that of the Kalman update. Nothing
     here has a derivative.
 

@@ -149,8 +149,10 @@ kalman_step.defvjp(_fwd, _bwd)
 def inverse_cholesky(S: Array) -> tuple[Array, Array, Array]:
     """Inverse A (m, m, ...) of the Cholesky factor of S, log det S (...), and whether it exists.
 
-    As `core.linalg.inverse_cholesky`, which says how; where S is not positive definite, or not
-    finite, A and the logarithm are zero.
+    By forward elimination of the table [S | I], which a multiplication by A turns into [L^T | A]:
+    finished rows and columns are cut off, so that column 0 is the next pivot's. Where S is not
+    positive definite, or not finite, A and the logarithm are zero, as of
+    `core.linalg.inverse_cholesky`.
     """
     table = jnp.concatenate([S, _eye_like(S)], axis=1)
     rows, pivots = [], []

@@ -82,6 +82,17 @@ def diagonal_neighbours(cells: Array) -> tuple[Array, Array, Array, Array]:
     return cells[2:, 2:], cells[:-2, 2:], cells[2:, :-2], cells[:-2, :-2]
 
 
+def ringed(cells: Array, value: int | bool) -> Array:
+    """Cells (H + 2, W + 2): those (H, W) given, in a ring of `value`.
+
+    As `jnp.pad`, which on a CPU asks of each cell where it is: written as one block it is copied.
+    """
+    side = jnp.full((cells.shape[0], 1), value, cells.dtype)
+    end = jnp.full((1, cells.shape[1] + 2), value, cells.dtype)
+    whole = jnp.concatenate([end, jnp.concatenate([side, cells, side], axis=1), end])
+    return lax.optimization_barrier(whole)
+
+
 def as_unsigned(cells: tuple[Array, ...]) -> Iterator[Array]:
     """The bits of int8 arrays as uint8: what holds no label is above all labels."""
     return (lax.bitcast_convert_type(x, jnp.uint8) for x in cells)
@@ -226,7 +237,7 @@ def expand_encoded(start: Array, *, steps: int, octagon: bool = False) -> Encode
     if steps < 0:
         raise ValueError(f"steps is {steps}, not 0 or more")
     expand_padded = sequential_vmap_on_cpu(partial(_expand_padded, steps=steps, octagon=octagon))
-    cells, waited = expand_padded(jnp.pad(start, 1, constant_values=FROZEN))
+    cells, waited = expand_padded(ringed(start, FROZEN))
     return EncodedDiagram(cells[1:-1, 1:-1], waited[1:-1, 1:-1])
 
 

@@ -157,24 +157,20 @@ def segment_cells(
     is_last = jnp.arange(of_beam.size, dtype=jnp.int32) == of_beam.size - 1
     continues = (of_beam == jnp.roll(of_beam, -1)) & ~is_last
     continues &= segments.valid[jnp.minimum(of_beam, capacity - 1)]
-    step = jnp.asarray(np.arange(points_per_gap) / points_per_gap, xy.dtype)
-    fraction = jnp.where(continues[None], step[:, None], 0.0)
+    # In cells, and a beam of no segment outside of the grid.
+    x = jnp.where(of_beam < capacity, (xy[:, 0] - spec.x_min) / spec.cell_size, -1.0)
+    y = (xy[:, 1] + spec.y_half) / spec.cell_size
+    to_next = jnp.where(continues, jnp.stack([jnp.roll(x, -1) - x, jnp.roll(y, -1) - y]), 0.0)
 
-    def row(x: Array, low: float) -> Array:
-        """Index (P, R) of the cells along one axis; as of `grid.cell_of`, not yet an integer."""
-        return jnp.floor((x[None] + fraction * (jnp.roll(x, -1) - x)[None] - low) / spec.cell_size)
-
-    # The points of a beam lead, and each axis is an array of its own: both are vectorised.
-    i, j = row(xy[:, 0], spec.x_min), row(xy[:, 1], -spec.y_half)
-    inside = (of_beam < capacity)[None] & (i >= 0.0) & (i < height) & (j >= 0.0) & (j < width)
-    # One index for a cell, the last for what is outside: faster than two indices.
-    size = height * width
-    i, j = (jnp.where(inside, x, 0.0).astype(jnp.int32) for x in (i, j))
-    cell = jnp.where(inside, i * width + j, size).reshape(-1)
-    values = jnp.tile(of_beam.astype(jnp.int8), points_per_gap)
-
-    def draw(cell: Array, values: Array) -> Array:
+    def draw(at: Array, to_next: Array, values: Array) -> Array:
+        fraction = jnp.asarray(np.arange(points_per_gap) / points_per_gap, at.dtype)
+        i, j = jnp.floor(at[:, None] + fraction[None, :, None] * to_next[:, None])
+        inside = (i >= 0.0) & (i < height) & (j >= 0.0) & (j < width)
+        # One index for a cell, the last for what is outside: faster than two indices.
+        size = height * width
+        cell = jnp.where(inside, i * width + j, size).astype(jnp.int32)
         blank = jnp.full(size + 1, -1, jnp.int8)
+        values = jnp.broadcast_to(values.astype(jnp.int8), cell.shape)
         return blank.at[cell].max(values, mode="promise_in_bounds")
 
-    return sequential_vmap_on_cpu(draw)(cell, values)[:-1].reshape(spec.shape)
+    return sequential_vmap_on_cpu(draw)(jnp.stack([x, y]), to_next, of_beam)[:-1].reshape(spec.shape)

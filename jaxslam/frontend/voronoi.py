@@ -15,6 +15,7 @@ from jaxslam.frontend.automaton import (
     diagonal_neighbours,
     four_neighbours,
     neighbours,
+    ringed,
     single_labels,
 )
 
@@ -87,10 +88,10 @@ def encoded_junction_cells(encoded: EncodedDiagram, sources: Array) -> Array:
     check_array("encoded.cells", encoded.cells, ("H", "W"), jnp.int8)
     check_array("sources", sources, encoded.cells.shape, jnp.bool_)
     own = jnp.where(sources, jnp.int8(FROZEN), encoded.cells)
-    padded = jnp.pad(own, 1, constant_values=FROZEN)
+    padded = ringed(own, FROZEN)
     block = (own, *four_neighbours(padded), *diagonal_neighbours(padded))
     largest = reduce(jnp.maximum, block)
     smallest = reduce(jnp.minimum, as_unsigned(block))
     smallest = lax.bitcast_convert_type(smallest, jnp.int8)  # negative where no label is
-    between = reduce(jnp.logical_or, ((x > smallest) & (x < largest) for x in block))
-    return between & (smallest >= 0) & (encoded.cells != EMPTY) & ~sources
+    below = reduce(jnp.maximum, (jnp.where(x == largest, jnp.int8(FROZEN), x) for x in block))
+    return (below > smallest) & (smallest >= 0) & (encoded.cells != EMPTY) & ~sources

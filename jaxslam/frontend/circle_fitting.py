@@ -13,8 +13,8 @@ from jaxslam.frontend.tangent_circles import (
     FootPoints,
     TangentCircles,
     WallSegments,
-    foot_cosine,
     foot_points,
+    largest_cosine,
     one_of,
     wall_segments,
 )
@@ -93,19 +93,19 @@ def _hidden_depth(x: Array, y: Array, radius: Array, segments: Segments, thick: 
 
 
 def _touched(
-    start: TangentCircles, foot: FootPoints, variance: Array, valid: Array, within: float
+    start: TangentCircles, foot: FootPoints, variance: Array, walls: WallSegments, within: float
 ) -> Array:
     """Walls (K, C) bool that circles touch: their own three, and those within the errors.
 
     A wall whose foot is in about the direction of one of the three (cosine above `MAX_FOOT_COSINE`)
     is not counted again: it is probably the next segment of the same wall, with a correlated error.
     """
-    index = jnp.arange(len(valid), dtype=jnp.int32)[:, None]
+    index = jnp.arange(len(walls.valid), dtype=jnp.int32)[:, None]
     touched = jnp.abs(foot.distance - start.radius[None]) < within * jnp.sqrt(variance)
-    cosines = [foot_cosine(foot.toward, wall) for wall in start.walls]
-    touched &= jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2]) < MAX_FOOT_COSINE
+    own = foot_points(start.x, start.y, walls.of(start.walls))
+    touched &= largest_cosine(foot.toward, own.toward) < MAX_FOOT_COSINE
     touched |= one_of(start.walls, index)
-    return touched & valid
+    return touched & walls.valid
 
 
 _Three = tuple[Array, Array, Array]
@@ -139,7 +139,7 @@ def fit_circles(
     walls, x, y, radius = wall_segments(segments), start.x, start.y, start.radius
     foot = foot_points(x, y, walls)
     variance = _variance(foot, walls, segments)
-    touched = _touched(start, foot, variance, walls.valid, within)
+    touched = _touched(start, foot, variance, walls, within)
     w = lax.stop_gradient(jnp.where(touched, 1.0 / variance, 0.0))
     total = jnp.maximum(jnp.sum(w, axis=0), 1e-9)
 

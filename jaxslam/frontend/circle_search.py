@@ -18,10 +18,10 @@ from jaxslam.core.types import Array
 from jaxslam.frontend.features import FeatureSpec
 from jaxslam.frontend.grid import GridSpec, centre_of, grid_origin
 from jaxslam.frontend.pyramid import Level
+from jaxslam.frontend.segments import MAX_SEGMENTS
 from jaxslam.frontend.tangent_circles import (
     TangentCircles,
     WallSegments,
-    foot_points,
     nearest_three_walls,
     tangent_circles,
 )
@@ -59,25 +59,26 @@ def _nearest_cells(cells: Array, spec: GridSpec, count: int) -> tuple[Array, Arr
     rank = np.empty(height * width, np.min_scalar_type(-(height * width + 1)))
     rank[nearest_last] = np.arange(1, height * width + 1)
     key = jnp.where(cells, jnp.asarray(rank.reshape(height, width)), jnp.zeros((), rank.dtype))
-    key = _largest_of_blocks(_largest_of_blocks(key, axis=0), axis=1).astype(jnp.float32)
-    top, _ = lax.top_k(key.reshape(-1), min(count, key.size))
+    key = _largest_of_blocks(key).astype(jnp.float32)
+    top, _ = lax.top_k(key, min(count, key.size))
     top = jnp.pad(top, (0, count - top.size))
     flat = jnp.asarray(nearest_last)[jnp.maximum(top, 1.0).astype(jnp.int32) - 1]
     xy = centre_of(spec, jnp.stack([flat // width, flat % width], axis=-1))
     return xy[:, 0], xy[:, 1], top > 0.0
 
 
-def _largest_of_blocks(key: Array, axis: int) -> Array:
-    """Largest of each `BLOCK` entries along an axis, of those left at its end together."""
-    size = key.shape[axis]
-    whole = size - size % BLOCK
-    # Slices and no reduction of a padded array: these are vectorised.
-    every = (lax.slice_in_dim(key, k, whole, BLOCK, axis) for k in range(BLOCK))
-    key, rest = lax.optimization_barrier((reduce(jnp.maximum, every), key))
-    if whole == size:
-        return key
-    rest = jnp.max(lax.slice_in_dim(rest, whole, size, axis=axis), axis=axis, keepdims=True)
-    return jnp.concatenate([key, rest], axis=axis)
+def _largest_of_blocks(key: Array) -> Array:
+    """Largest of each block of `BLOCK` x `BLOCK` cells (H, W), of those cut off at the ends too."""
+    height, width = (size - size % BLOCK for size in key.shape)
+    found = []
+    for rows in (key[:height].reshape(-1, BLOCK, key.shape[1]), key[None, height:]):
+        if rows.size:
+            largest = jnp.max(rows, axis=1)  # a reduction: XLA does not compute it once a column
+            every = (largest[:, k:width:BLOCK] for k in range(BLOCK))
+            found += [reduce(jnp.maximum, every)] if width else []
+            if width < key.shape[1]:
+                found.append(jnp.max(largest[:, width:], axis=1, keepdims=True))
+    return jnp.concatenate([x.reshape(-1) for x in found])
 
 
 def best_apart(score: Array, xy: Array, min_distance: float, count: int) -> tuple[Array, Array]:
@@ -135,13 +136,12 @@ def _starts(
     """
     x, y, found = _nearest_cells(cells, level.grid, CELLS_PER_START * count)
     x, y = x.astype(dtype), y.astype(dtype)
-    foot = foot_points(x, y, walls)
-    three = nearest_three_walls(foot, math.cos(0.7 * spec.min_foot_angle))
-    clearance = jnp.min(foot.distance, axis=0)
+    three, clearance = nearest_three_walls(x, y, walls, math.cos(0.7 * spec.min_foot_angle))
     found &= clearance > spec.min_clearance - level.grid.cell_size
     found &= clearance < spec.max_clearance * level.scale + level.grid.cell_size
     a, b, c = sorted_three(three)
-    same = (a[:, None] == a[None]) & (b[:, None] == b[None]) & (c[:, None] == c[None])
+    walls_of = (a * MAX_SEGMENTS + b) * MAX_SEGMENTS + c
+    same = walls_of[:, None] == walls_of[None]
     dx, dy = x[:, None] - x[None], y[:, None] - y[None]
     same &= dx * dx + dy * dy < (SAME_START * level.scale) ** 2
     # `same` is symmetric: over the first axis the reduction is vectorised.

@@ -58,7 +58,7 @@ def fill_dropouts(lidar: Lidar, spec: SegmentSpec, scan: Scan) -> FilledScan:
     """
     r, hit, count = scan.ranges, scan.hit, scan.ranges.size
     beam = jnp.arange(count, dtype=jnp.int32)
-    previous, following = _last_returns(hit), _last_returns(hit, reverse=True)
+    previous, following = _nearest_returns(hit)
     padded = jnp.pad(r, 1, constant_values=1.0)
     before, after = padded[previous + 1], padded[following + 1]
     back, on = beam - previous, following - beam  # numbers of beams
@@ -105,15 +105,14 @@ def _angles(lidar: Lidar) -> np.ndarray:
     return np.minimum(np.arange(lidar.num_beams + 2) * lidar.angle_increment, 0.5 * np.pi)
 
 
-def _last_returns(hit: Array, *, reverse: bool = False) -> Array:
-    """Number (R,) int32 of the last return before each beam, or of the first after it.
+def _nearest_returns(hit: Array) -> tuple[Array, Array]:
+    """Number (R,) int32 of the last return before each beam, and of the first after it.
 
     Args:
         hit: (R,) bool.
-        reverse: The first after it.
 
     Returns:
-        -1, or R for the first after it, where there is none.
+        -1 where there is none before it, R where there is none after it.
     """
     beam = jnp.arange(hit.size, dtype=jnp.int32)
 
@@ -121,8 +120,10 @@ def _last_returns(hit: Array, *, reverse: bool = False) -> Array:
         own, is_hit = here
         return jnp.where(is_hit, own, last), last
 
-    none = jnp.int32(hit.size if reverse else -1)
-    return lax.scan(pass_beam, none, (beam, hit), reverse=reverse)[1]
+    # From both ends in one loop; from the last beam on they are counted backwards.
+    both = beam, jnp.stack([hit, hit[::-1]], axis=1)
+    last = lax.scan(pass_beam, jnp.full(2, -1, jnp.int32), both)[1]
+    return last[:, 0], hit.size - 1 - last[::-1, 1]
 
 
 def _is_predicted(

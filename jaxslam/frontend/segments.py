@@ -173,4 +173,6 @@ def segment_cells(
         values = jnp.broadcast_to(values.astype(jnp.int8), cell.shape)
         return blank.at[cell].max(values, mode="promise_in_bounds")
 
-    return sequential_vmap_on_cpu(draw)(jnp.stack([x, y]), to_next, of_beam)[:-1].reshape(spec.shape)
+    return sequential_vmap_on_cpu(draw)(jnp.stack([x, y]), to_next, of_beam)[:-1].reshape(
+        spec.shape
+    )

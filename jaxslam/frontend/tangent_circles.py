@@ -21,6 +21,7 @@ Layout: walls lead (K) and circles trail (C), so that sums and minima over the w
 over all circles.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -125,31 +126,41 @@ def nearest_wall(distance: Array) -> Array:
     return jnp.min(jnp.where(distance <= smallest, index, len(distance) - 1), axis=0)
 
 
-def foot_cosine(toward: tuple[Array, Array], wall: Array) -> Array:
-    """Cosines (K, C) of the angles between all feet and those of the walls with index (C,)."""
-    tx, ty = toward
-    index = jnp.arange(len(tx), dtype=jnp.int32)[:, None]
-    one_hot = (index == wall[None]).astype(tx.dtype)
-    wall_tx, wall_ty = jnp.sum(one_hot * tx, axis=0), jnp.sum(one_hot * ty, axis=0)
-    return tx * wall_tx[None] + ty * wall_ty[None]
+def _cosine(toward: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Cosines (K, C) of the angles between unit vectors, (K, C) or (1, C)."""
+    return toward[0] * other[0] + toward[1] * other[1]
 
 
-def nearest_three_walls(foot: FootPoints, max_cosine: float) -> Array:
+def largest_cosine(toward: tuple[Array, Array], three: tuple[Array, Array]) -> Array:
+    """Cosine (K, C) of the angle between unit vectors (K, C) and the nearest of (3, C)."""
+    x, y = three
+    return reduce(
+        jnp.maximum, (_cosine(toward, (x[k : k + 1], y[k : k + 1])) for k in range(len(x)))
+    )
+
+
+def nearest_three_walls(
+    x: Array, y: Array, walls: WallSegments, max_cosine: float
+) -> tuple[Array, Array]:
     """The three nearest walls whose feet lie in different directions.
 
     Args:
-        foot: Feet of K walls for C circles.
+        x: (C,) [m] centre, robot frame.
+        y: (C,) [m] centre, robot frame.
+        walls: (K, 1) all walls.
         max_cosine: Cosine of the smallest angle between two of the three feet.
 
     Returns:
-        Index (3, C) int32, nearest first.
+        Index (3, C) int32, nearest first, and the distance (C,) [m] to the nearest.
     """
-    first = nearest_wall(foot.distance)
-    near_first = foot_cosine(foot.toward, first)
-    second = nearest_wall(jnp.where(near_first < max_cosine, foot.distance, jnp.inf))
-    near_both = jnp.maximum(near_first, foot_cosine(foot.toward, second))
-    third = nearest_wall(jnp.where(near_both < max_cosine, foot.distance, jnp.inf))
-    return jnp.stack([first, second, third])
+    foot = foot_points(x, y, walls)
+    distance, index = foot.distance, [nearest_wall(foot.distance)]
+    for _ in range(2):
+        last = foot_points(x, y, walls.of(index[-1][None]))
+        apart = _cosine(foot.toward, last.toward) < max_cosine
+        distance = jnp.where(apart, distance, jnp.inf)
+        index.append(nearest_wall(distance))
+    return jnp.stack(index), jnp.min(foot.distance, axis=0)
 
 
 def _newton(
@@ -198,12 +209,6 @@ def one_of(three: Array, index: Array) -> Array:
 
 _Circle = tuple[Array, Array, Array]
 """Centres x and y (C,) and walls (3, C)."""
-
-
-def _of_wall(toward: tuple[Array, Array], is_wall: Array) -> tuple[Array, Array]:
-    """Direction ((C,), (C,)) to the foot of one wall for each circle, `is_wall` (K, C)."""
-    tx, ty = (jnp.sum(jnp.where(is_wall, t, 0.0), axis=0) for t in toward)
-    return tx, ty
 
 
 def tangent_circles(
@@ -258,18 +263,16 @@ def tangent_circles(
         x, y, own, others = solve(x, y, three)
         intruder = nearest_wall(others.distance)
         penetration = jnp.mean(own.distance, axis=0) - jnp.min(others.distance, axis=0)
-        tx, ty = _of_wall(others.toward, index == intruder[None])
-        own_tx, own_ty = own.toward
-        replaced = nearest_wall(-(tx[None] * own_tx + ty[None] * own_ty))
+        toward = foot_points(x, y, walls.of(intruder[None])).toward
+        replaced = nearest_wall(-_cosine(own.toward, toward))
         replaces = jnp.arange(3, dtype=jnp.int32)[:, None] == replaced[None]  # (3, C)
         replaces &= (penetration > 1e-3)[None]
         return (x, y, jnp.where(replaces, intruder[None], three)), None
 
     (x, y, three), _ = lax.scan(solve_and_swap, (x, y, three), length=swaps)
     x, y, own, others = solve(x, y, three)
-    (tx, ty), (own_tx, own_ty) = others.toward, own.toward
-    cosines = [tx * own_tx[k][None] + ty * own_ty[k][None] for k in range(3)]
-    largest = jnp.maximum(jnp.maximum(cosines[0], cosines[1]), cosines[2])
+    own_tx, own_ty = own.toward
+    largest = largest_cosine(others.toward, own.toward)
     between = [own_tx[i] * own_tx[j] + own_ty[i] * own_ty[j] for i, j in ((0, 1), (1, 2), (2, 0))]
     cosine = jnp.maximum(jnp.maximum(between[0], between[1]), between[2])
     radius = jnp.mean(own.distance, axis=0)

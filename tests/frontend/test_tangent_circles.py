@@ -88,9 +88,7 @@ def test_padding_touches_nothing():
     segments = np.vstack([three_around(np.random.default_rng(1)), [[0.0, -0.1, 0.0, 0.1]]])
     walls = walls_of(segments)
     walls = walls._replace(valid=walls.valid.at[3].set(False))
-    found = tangent_circles.nearest_three_walls(
-        tangent_circles.foot_points(jnp.zeros(1), jnp.zeros(1), walls), 0.9
-    )
+    found, _ = tangent_circles.nearest_three_walls(jnp.zeros(1), jnp.zeros(1), walls, 0.9)
     assert sorted(found[:, 0].tolist()) == [0, 1, 2]
     circle = tangent([0.1, 0.0], [0, 1, 2], walls)
     assert sorted(circle.walls[:, 0].tolist()) == [0, 1, 2] and circle.penetration[0] < 0
@@ -101,11 +99,13 @@ def test_the_nearest_three_walls_lie_in_directions_that_differ():
     box = worlds.outline([(-1.0, -2.0, 1.5, 2.5)])
     ahead = np.array([[1.6, -2.0, 1.6, 2.0]])
     walls = walls_of(np.vstack([box, ahead]))
-    foot = tangent_circles.foot_points(jnp.array([0.9, 0.2]), jnp.array([-0.5, 0.3]), walls)
-    three = tangent_circles.nearest_three_walls(foot, np.cos(0.5))
+    centres = jnp.array([0.9, 0.2]), jnp.array([-0.5, 0.3])
+    three, nearest = tangent_circles.nearest_three_walls(*centres, walls, np.cos(0.5))
     segments = np.vstack([box, ahead])
     for k, centre in enumerate(([0.9, -0.5], [0.2, 0.3])):
-        order = np.argsort(wall_distances(np.array(centre), segments))
+        distances = wall_distances(np.array(centre), segments)
+        np.testing.assert_allclose(nearest[k], distances.min(), atol=1e-12)
+        order = np.argsort(distances)
         want = [n for n in order if n != 4][:3]
         assert three[:, k].tolist() == want
 
@@ -129,8 +129,8 @@ def test_a_wall_that_cuts_in_takes_the_place_of_the_one_most_like_it():
 def test_the_fourth_wall_leads_to_the_other_of_two_junctions_that_are_near():
     """In a room that is nearly square two circles touch three walls, 0.3 m from each other."""
     walls = walls_of(ROOM)
-    foot = tangent_circles.foot_points(jnp.array([0.95]), jnp.array([1.0]), walls)
-    first = tangent([0.95, 1.0], tangent_circles.nearest_three_walls(foot, 0.9)[:, 0], walls)
+    three, _ = tangent_circles.nearest_three_walls(jnp.array([0.95]), jnp.array([1.0]), walls, 0.9)
+    first = tangent([0.95, 1.0], three[:, 0], walls)
     np.testing.assert_allclose([first.x[0], first.y[0], first.radius[0]], 1.0, atol=1e-9)
     (fourth,) = set(range(4)) - set(first.walls[:, 0].tolist())
     assert first.fourth_wall[0] == fourth
@@ -149,7 +149,7 @@ def fitted(segments, start, within=SPEC.tangency_gate):
     """Circle near a point that is fitted to the segments of a scan."""
     walls = tangent_circles.wall_segments(segments)
     x, y = start[:1], start[1:]
-    three = tangent_circles.nearest_three_walls(tangent_circles.foot_points(x, y, walls), 0.9)
+    three, _ = tangent_circles.nearest_three_walls(x, y, walls, 0.9)
     circle = tangent_circles.tangent_circles(x, y, three, walls, swaps=3)
     circle = circle_fitting.fit_circles(circle, segments, within=within, thick=SPEC.wall_thickness)
     circle = circle._replace(centre=circle.centre.T, cov=circle.cov.T)

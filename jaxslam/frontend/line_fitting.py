@@ -293,15 +293,15 @@ def line_moments(xy: Array, weight: Array, of: Array, *, lines: int) -> Moments:
         of: (R,) int32 line of each point; other numbers than 0..K-1 count nowhere.
         lines: K.
     """
-    one_hot = (of[None] == jnp.arange(lines, dtype=jnp.int32)[:, None]).astype(xy.dtype)
-    weighted = weight[:, None] * xy
-    sums = one_hot @ jnp.concatenate([weight[:, None], weighted], axis=1)
-    total = sums[:, 0]
-    mean = sums[:, 1:] / jnp.maximum(total, 1e-9)[:, None]
+    # Lines last: of a product, that is the axis that is vectorised.
+    one_hot = (of[:, None] == jnp.arange(lines, dtype=jnp.int32)[None]).astype(xy.dtype)
+    wx, wy = weight * xy[:, 0], weight * xy[:, 1]
+    total, sum_x, sum_y = jnp.stack([weight, wx, wy]) @ one_hot
+    mean = jnp.stack([sum_x, sum_y], axis=1) / jnp.maximum(total, 1e-9)[:, None]
     offset = xy - mean.at[of].get(mode="clip")
     wx, wy = weight * offset[:, 0], weight * offset[:, 1]
-    products = jnp.stack([wx * offset[:, 0], wx * offset[:, 1], wy * offset[:, 1]], axis=1)
-    return Moments(total, mean, one_hot @ products)
+    products = jnp.stack([wx * offset[:, 0], wx * offset[:, 1], wy * offset[:, 1]])
+    return Moments(total, mean, jnp.stack([*(products @ one_hot)], axis=1))
 
 
 def principal_axes(scatter: Array) -> tuple[Array, Array, Array]:

@@ -162,17 +162,20 @@ def segment_cells(
     y = (xy[:, 1] + spec.y_half) / spec.cell_size
     to_next = jnp.where(continues, jnp.stack([jnp.roll(x, -1) - x, jnp.roll(y, -1) - y]), 0.0)
 
-    def draw(at: Array, to_next: Array, values: Array) -> Array:
-        fraction = jnp.asarray(np.arange(points_per_gap) / points_per_gap, at.dtype)
-        i, j = jnp.floor(at[:, None] + fraction[None, :, None] * to_next[:, None])
+    def draw(x: Array, y: Array, to_x: Array, to_y: Array, values: Array) -> Array:
+        fraction = jnp.asarray(np.arange(points_per_gap) / points_per_gap, x.dtype)[:, None]
+        # The points of a beam lead, and each axis is an array of its own: both are vectorised.
+        i, j = (
+            jnp.floor(x[None] + fraction * to_x[None]),
+            jnp.floor(y[None] + fraction * to_y[None]),
+        )
         inside = (i >= 0.0) & (i < height) & (j >= 0.0) & (j < width)
         # One index for a cell, the last for what is outside: faster than two indices.
         size = height * width
-        cell = jnp.where(inside, i * width + j, size).astype(jnp.int32)
+        i, j = (jnp.where(inside, k, 0.0).astype(jnp.int32) for k in (i, j))
+        cell = jnp.where(inside, i * width + j, size)
         blank = jnp.full(size + 1, -1, jnp.int8)
         values = jnp.broadcast_to(values.astype(jnp.int8), cell.shape)
         return blank.at[cell].max(values, mode="promise_in_bounds")
 
-    return sequential_vmap_on_cpu(draw)(jnp.stack([x, y]), to_next, of_beam)[:-1].reshape(
-        spec.shape
-    )
+    return sequential_vmap_on_cpu(draw)(x, y, *to_next, of_beam)[:-1].reshape(spec.shape)

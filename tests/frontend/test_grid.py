@@ -195,3 +195,16 @@ def test_wrong_shapes_and_types_are_named_while_tracing(call, message):
     scans = Scan(jnp.zeros((2, 361)), jnp.zeros((2, 361), bool))
     with pytest.raises(ValueError, match=re.escape(message)):
         jax.eval_shape(call, scans)
+
+
+@pytest.mark.parametrize("count", [1, 7, 32, 33])
+def test_free_cells_of_a_batch_are_those_of_each_scan(count):
+    """Up to 32 scans are compared at once, as bits of one number."""
+    random = np.random.default_rng(count)
+    ranges = jnp.asarray(random.uniform(0.1, 8.0, (count, FRONT.num_beams)))
+    scans = Scan(ranges, jnp.ones(ranges.shape, bool))
+    batch = jax.jit(jax.vmap(lambda s: grid_module.seen_free(FRONT, SMALL, s)))(scans)
+    for k in range(count):
+        free = seen_free(FRONT, SMALL, Scan(ranges[k], scans.hit[k]))
+        np.testing.assert_array_equal(batch[k], free)
+    assert batch.any() and not batch.all()

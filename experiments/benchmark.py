@@ -1,11 +1,11 @@
 """Speed of the whole chain, of the front end and of the automaton, on one core, after compilation.
 
 Ray casting, front end and filter of trials of the office drive, also in life and with 5,000 walls
-(`life_benchmark`); the stages of the front end; the
-automaton, and the filter with its gradient, beside hand-written C and other libraries
-(`pip install '.[bench]'`); what the parts reach of what a core gives (`roofline`); and what the
-first start of a command costs, by that of another build where one is named (`cold_start`). Seconds
-depend on the machine; shares and ratios, measured in one process, depend on it little.
+(`life_benchmark`), and what each of their parts reaches of what the core gives (`roofline`); the
+stages of the front end; the automaton, and the filter with its gradient, beside hand-written C and
+other libraries, and scan matching beside the latter (`pip install '.[bench]'`); what the first
+start of a command costs, by that of another build where one is named (`cold_start`). Seconds depend
+on the machine; shares and ratios, measured in one process, depend on it little.
 """
 
 import sys
@@ -27,6 +27,7 @@ from experiments import (
     life_benchmark,
     peer_automata,
     peer_filters,
+    peer_matching,
     roofline,
 )
 from experiments.timing import fastest, pin, seconds
@@ -53,6 +54,7 @@ from jaxslam.simulation import trial_episodes
 from jaxslam.simulation.ray_casting import cast
 
 FRONTEND_SCANS = 512  # scans at most that the front end is timed on
+MATCHED_SCANS = 200  # of the drive on which scan matching is compared
 
 
 def batched(function: Callable) -> Callable:
@@ -175,7 +177,7 @@ def frontend(scans: Scan, maps: int, repeats: int) -> common.Numbers:
 
 def profile(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     """The parts of the chain, each with what it reaches of what the core gives, and that."""
-    core = roofline.machine(repeats)
+    core = roofline.machine(3 * repeats)
     rows = chain_profile.compute(seed, num_trials, repeats)
     return {
         "chain_profile": [roofline.with_bounds(row, core) for row in rows],
@@ -200,6 +202,7 @@ def compute(
         "life": life_benchmark.compute(seed, num_trials, repeats),
         "front_end": frontend(scans, maps, repeats),
         "estimator": of_filter,
+        "scan_matching": peer_matching.table(seed, MATCHED_SCANS, repeats),
     }
 
 
@@ -266,6 +269,7 @@ def main(argv: list[str] | None = None) -> int:
     chain_profile.print_table([{k: x for k, x in row.items() if k not in new} for row in rows])
     roofline.print_table(rows, numbers["roofline"])
     cold_start.print_table(numbers)
+    peer_matching.print_table(numbers["scan_matching"])
     print(f"{of_chain['scans_per_second']:.0f} scans per second on one core")
     print(percent(of_chain["share_of_chain"]))
     in_life = numbers["life"]

@@ -271,7 +271,7 @@ def draw(axis: Any, numbers: Numbers) -> None:
         bar.set_color(common.BLUE if "cold" in name else common.SKY)
     axis.bar_label(drawn, fmt="%.1f", padding=2)
     axis.margins(x=0.15)
-    axis.set_title("a new process on one core: seconds until all is written", fontsize=10)
+    axis.set_title("new processes: seconds until all is written", fontsize=10)
 
 
 def save_picture(numbers: Numbers, path: Path) -> None:

@@ -183,7 +183,7 @@ def draw(axis: Any, rows: list[dict[str, Any]], given: Numbers) -> None:
     found = [row for row in rows if row["intensity"] and ":" not in row["part"]]
     found.sort(key=lambda row: row["intensity"])
     peak = given["flops_per_s"]
-    first = found[0]["intensity"] / 3 if found else 0.1
+    first = found[0]["intensity"] / 10 if found else 0.1
     last = 3 * peak / given["memory_bytes_per_s"]
     for kind, colour in (("cache", common.ORANGE), ("memory", common.BLUE)):
         speed = given[f"{kind}_bytes_per_s"]

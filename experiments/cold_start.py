@@ -8,6 +8,7 @@ names another build, a wheel or a checkout, whose commands take turns with these
 import compileall
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -128,9 +129,11 @@ def start_once(build: Build, arguments: tuple[str, ...], cache: Path, out: Path)
     try:
         printed, errors = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, 9)
-        process.communicate()
         return {"note": f"it took longer than {TIMEOUT:.0f} s"}
+    finally:
+        if process.returncode is None:  # also where this process is interrupted
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
     if process.returncode:
         return {"note": f"it failed: {_last_line(errors)}"}
     return dict(zip(MEASURED, json.loads(printed), strict=True))

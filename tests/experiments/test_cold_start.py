@@ -1,6 +1,8 @@
 """Starts of builds that are written here: they work longer while their cache folder is empty."""
 
 import json
+import os
+import time
 import zipfile
 from pathlib import Path
 
@@ -18,7 +20,8 @@ def main():
         print("first line", file=sys.stderr)
         raise SystemExit("no such thing")
     if "slow" in sys.argv:
-        time.sleep(60.0)
+        pathlib.Path("pid").write_text(str(os.getpid()))
+        time.sleep(20.0)
     if not cache.exists():
         cache.mkdir()
         memory = b"1" * (SIZE << 20)
@@ -33,6 +36,15 @@ FILES = {"jaxslam/__init__.py": "", "jaxslam/cli/__init__.py": ""}
 def files(size=0, seconds=0.0):
     main = MAIN.replace("SIZE", str(size)).replace("SECONDS", str(seconds))
     return FILES | {"jaxslam/cli/main.py": main}
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    stat = Path(f"/proc/{pid}/stat")
+    return not stat.is_file() or stat.read_text().rpartition(") ")[2][0] != "Z"
 
 
 def checkout(folder, **costs):
@@ -79,9 +91,15 @@ def test_a_start_is_cold_once_and_has_its_own_time_and_memory(this, tmp_path):
 def test_commands_that_fail_or_take_too_long_have_a_note(this, tmp_path, monkeypatch):
     done = cold_start.start_once(this, ("bad",), tmp_path / "cache", tmp_path / "out")
     assert done == {"note": "it failed: no such thing"}
-    monkeypatch.setattr(cold_start, "TIMEOUT", 0.5)
+    monkeypatch.setattr(cold_start, "TIMEOUT", 2.0)
     done = cold_start.start_once(this, ("slow",), tmp_path / "cache", tmp_path / "out")
     assert "longer" in done["note"]
+    pid = int((tmp_path / "out" / "pid").read_text())
+    for _ in range(100):  # until the system has removed it
+        if not alive(pid):
+            break
+        time.sleep(0.05)
+    assert not alive(pid) and not (tmp_path / "out" / "done").exists()
 
 
 def test_all_numbers_of_two_builds(this, tmp_path, capsys):

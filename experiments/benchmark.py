@@ -1,12 +1,14 @@
 """Speed of the whole chain, of the front end and of the automaton, on one core, after compilation.
 
 Ray casting, front end and filter of trials of the office drive, also in life and with 5,000 walls
-(`life_benchmark`); the stages of the front end; the
-automaton, and the filter with its gradient, beside hand-written C and other libraries
-(`pip install '.[bench]'`). Seconds depend on the machine; shares and ratios, measured in one
-process, depend on it little.
+(`life_benchmark`), and what each of their parts reaches of what the core gives (`roofline`); the
+stages of the front end; the automaton, and the filter with its gradient, beside hand-written C and
+other libraries, and scan matching beside the latter (`pip install '.[bench]'`); what the first
+start of a command costs, by that of another build where one is named (`cold_start`). Seconds depend
+on the machine; shares and ratios, measured in one process, depend on it little.
 """
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -18,12 +20,15 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from experiments import (
     chain_profile,
+    cold_start,
     common,
     filter_benchmark,
     import_time,
     life_benchmark,
     peer_automata,
     peer_filters,
+    peer_matching,
+    roofline,
 )
 from experiments.timing import fastest, pin, seconds
 from jaxslam.core.batching import map_batches
@@ -49,6 +54,7 @@ from jaxslam.simulation import trial_episodes
 from jaxslam.simulation.ray_casting import cast
 
 FRONTEND_SCANS = 512  # scans at most that the front end is timed on
+MATCHED_SCANS = 200  # of the drive on which scan matching is compared
 
 
 def batched(function: Callable) -> Callable:
@@ -169,25 +175,40 @@ def frontend(scans: Scan, maps: int, repeats: int) -> common.Numbers:
     }
 
 
-def compute(seed: int, num_trials: int, maps: int, drives: int, repeats: int) -> common.Numbers:
+def profile(seed: int, num_trials: int, repeats: int) -> common.Numbers:
+    """The parts of the chain, each with what it reaches of what the core gives, and that."""
+    core = roofline.machine(3 * repeats)
+    rows = chain_profile.compute(seed, num_trials, repeats)
+    return {
+        "chain_profile": [roofline.with_bounds(row, core) for row in rows],
+        "roofline": core,
+    }
+
+
+def compute(
+    seed: int, num_trials: int, maps: int, drives: int, repeats: int, log: str, against: str
+) -> common.Numbers:
     """All numbers, by what they measure."""
+    of_starts = cold_start.compute(seed, log, against, repeats=1)
     of_chain, scans = chain(seed, num_trials, repeats)
     of_filter = filter_benchmark.compute(seed, drives, repeats, office=num_trials)
     return {
         "seed": seed,
         "cores": 1,
         "import_vs_jax": import_time.import_vs_jax(),
+        **of_starts,
         "chain": of_chain,
-        "chain_profile": chain_profile.compute(seed, num_trials, repeats),
+        **profile(seed, num_trials, repeats),
         "life": life_benchmark.compute(seed, num_trials, repeats),
         "front_end": frontend(scans, maps, repeats),
         "estimator": of_filter,
+        "scan_matching": peer_matching.table(seed, MATCHED_SCANS, repeats),
     }
 
 
 def draw(numbers: common.Numbers, path: Path) -> None:
-    """Bars: time of each part of the chain and of the front end; peers of automaton and filter."""
-    figure, axes = common.canvas(11, 8.4, 3, 2)
+    """Bars: time of the chain, the front end, peers, and starts; and the roofline of a core."""
+    figure, axes = common.canvas(11, 11.6, 4, 2)
     figure.suptitle("one core", fontsize=10)
     found = numbers["front_end"]
     bars(axes[0, 0], numbers["chain"]["ms_per_scan"], "%.2f", "chain: milliseconds per scan")
@@ -203,6 +224,8 @@ def draw(numbers: common.Numbers, path: Path) -> None:
     }
     bars(axes[2, 0], steps["filter"], "%.3g", "filter: microseconds per step of a trial")
     bars(axes[2, 1], steps["gradient"], "%.3g", "value and gradient: microseconds per step")
+    roofline.draw(axes[3, 0], numbers["chain_profile"], numbers["roofline"])
+    cold_start.draw(axes[3, 1], numbers)
     for axis in (axes[1, 1], *axes[2]):
         axis.set_xscale("log")
         axis.minorticks_off()
@@ -231,14 +254,22 @@ def bars(axis: Any, values: dict[str, float], form: str, title: str) -> None:
     axis.set_title(title, fontsize=10)
 
 
-def main(argv: list[str] | None = None) -> None:
+@common.report_errors("benchmark")
+def main(argv: list[str] | None = None) -> int:
     """Run the benchmark."""
     pin()
-    args = common.parse(__doc__, argv, runs=4, maps=256, drives=512, repeats=3)
-    numbers = compute(args.seed, args.runs, args.maps, args.drives, args.repeats)
+    sizes = {"runs": 4, "maps": 256, "drives": 512, "repeats": 3}
+    args = common.parse(__doc__, argv, **sizes, log="", against="")
+    numbers = compute(
+        *(args.seed, args.runs, args.maps, args.drives, args.repeats), args.log, args.against
+    )
     common.save(args.out, "benchmark", numbers, draw)
-    of_chain, of_front = numbers["chain"], numbers["front_end"]
-    chain_profile.print_table(numbers["chain_profile"])
+    of_chain, of_front, rows = numbers["chain"], numbers["front_end"], numbers["chain_profile"]
+    new = set(roofline.KEYS)
+    chain_profile.print_table([{k: x for k, x in row.items() if k not in new} for row in rows])
+    roofline.print_table(rows, numbers["roofline"])
+    cold_start.print_table(numbers)
+    peer_matching.print_table(numbers["scan_matching"])
     print(f"{of_chain['scans_per_second']:.0f} scans per second on one core")
     print(percent(of_chain["share_of_chain"]))
     in_life = numbers["life"]
@@ -256,7 +287,8 @@ def main(argv: list[str] | None = None) -> None:
     print({name: x if x is None else round(x, 2) for name, x in ratio.items()})
     imports = {code: round(x, 2) for code, x in numbers["import_vs_jax"].items()}
     print(f"processor time of imports, by that of `{import_time.JAX}`: {imports}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

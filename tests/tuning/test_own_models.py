@@ -230,7 +230,7 @@ def test_a_parameter_without_numbers_may_be_there_and_be_frozen():
     assert tuned(params=params, frozen=("none", "q")).params["q"] == 1.0
 
 
-def test_only_short_data_are_compiled_quickly(monkeypatch):
+def test_only_gradients_of_short_data_are_compiled_quickly(monkeypatch):
     used = []
 
     class Recorded(DeviceMap):
@@ -242,10 +242,16 @@ def test_only_short_data_are_compiled_quickly(monkeypatch):
     monkeypatch.setattr(fitting, "QUICK_STEPS", 12)
     fitting._over_devices.cache_clear()
     model = Model(lambda params, data: 0.0, lambda params, state, x: (state, x * params))
-    found = [
-        fitting.values(model, jnp.float64(2.0), np.ones((count, 4)), lambda info, data: info.mean())
-        for count in (3, 4)
-    ]
-    assert used == [True, False]
-    np.testing.assert_allclose(found[1], 2.0)
+
+    def mean(info, data):
+        return info.mean()
+
+    for count, quickly in ((3, True), (4, False)):
+        data = np.ones((count, 4))
+        found = fitting.values(model, jnp.float64(2.0), data, mean)
+        value, gradient = fitting.gradients(model, jnp.float64(2.0), data, mean)
+        np.testing.assert_allclose([found, value], 2.0)
+        np.testing.assert_allclose(gradient, 1.0)
+        assert used[-1] == quickly
+    assert used == [False, True, False]
     fitting._over_devices.cache_clear()

@@ -50,6 +50,7 @@ class SubmapState(NamedTuple):
 
     Attributes:
         belief: Of the filter, in the frame of the open submap.
+        origin: (3,) [m, m, rad] of the open submap, map frame, as its first scan shows it.
         driven: [m] in the open submap.
         start: (3,) [m, m, rad] origin of the first submap, map frame.
         submaps: Those that are closed.
@@ -58,16 +59,12 @@ class SubmapState(NamedTuple):
     """
 
     belief: Belief
+    origin: np.ndarray
     driven: float
     start: np.ndarray
     submaps: tuple[Submap, ...]
     landmark_index: tuple[np.ndarray, ...]
     joined: JoinedSubmaps | None
-
-    @property
-    def origin(self) -> np.ndarray:
-        """Origin (3,) [m, m, rad] of the open submap, map frame."""
-        return self.start if self.joined is None else self.joined.origins[-1]
 
 
 class SubmapResult(NamedTuple):
@@ -99,7 +96,7 @@ def init(config: FilterConfig, start: AnyArray) -> SubmapState:
         ValueError: As of `begin_submap`, or `start` is no pose.
     """
     start = as_float64("start", start, (3,))
-    return SubmapState(begin_submap(config), 0.0, start, (), (), None)
+    return SubmapState(begin_submap(config), start, 0.0, start, (), (), None)
 
 
 def update(
@@ -113,7 +110,9 @@ def update(
     """Filter some scans; before, close the open submap where it is due.
 
     A submap ends with the increment that leads to the first scan of the next, whose frame is the
-    pose of that scan: its landmarks are seen from the origin itself.
+    pose of that scan: its landmarks are seen from the origin itself. That scan is a measurement of
+    the next submap alone; where the one before sees its landmarks, too, `SubmapState.origin` takes
+    the pose that it has there, and no estimate of a submap is made with it.
 
     Args:
         config: Configuration of the filter.
@@ -135,8 +134,12 @@ def update(
     odometry = np.array(measurements.odometry)
     if state.driven >= spec.max_distance or _is_full(config, state.belief):
         first = jax.tree.map(lambda x: x[0], measurements)
+        seen = run_filter(config, params, state.belief, measurements)[1].pose[0]
         ended = state._replace(belief=_predict(config, params, state.belief, first))
         state = close(config, spec, ended)
+        assert state.joined is not None
+        origin = se2_np.compose(state.joined.origins[-2], np.asarray(seen, float))
+        state = state._replace(origin=origin)
         odometry[0] = 0.0
     belief, info = run_filter(
         config, params, state.belief, measurements._replace(odometry=jnp.asarray(odometry))
@@ -156,12 +159,11 @@ def _predict(
 def close(config: FilterConfig, spec: SubmapSpec, state: SubmapState) -> SubmapState:
     """Close the open submap, join it with the others, and begin the next."""
     submap = close_submap(config, state.belief)
-    origin, joined = state.origin, state.joined
-    submaps = (*state.submaps, submap)
+    joined, submaps = state.joined, (*state.submaps, submap)
     if joined is None:
         origins = state.start[None]
         landmark_index: tuple[np.ndarray, ...] = (np.arange(len(submap.positions)),)
-        positions = se2_np.transform(origin, submap.positions)
+        positions = se2_np.transform(state.start, submap.positions)
     else:
         origins = joined.origins
         landmark_index, positions = number_landmarks(
@@ -170,12 +172,13 @@ def close(config: FilterConfig, spec: SubmapSpec, state: SubmapState) -> SubmapS
     joined = join_submaps(
         submaps,
         landmark_index,
-        np.concatenate([origins, se2_np.compose(origin, submap.last_pose)[None]]),
+        np.concatenate([origins, se2_np.compose(origins[-1], submap.last_pose)[None]]),
         positions,
         previous=joined,
         max_iterations=spec.max_iterations,
     )
-    return SubmapState(begin_submap(config), 0.0, state.start, submaps, landmark_index, joined)
+    begun = begin_submap(config)
+    return SubmapState(begun, joined.origins[-1], 0.0, state.start, submaps, landmark_index, joined)
 
 
 def run_submaps(

@@ -24,6 +24,7 @@ from experiments import common, town, workload
 from experiments.common import Numbers
 from experiments.filter_benchmark import run_named_task, run_task
 from jaxslam.core import se2_np
+from jaxslam.core.batching import on_device
 from jaxslam.core.caches import enable_caches
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.memory import memory_now, peak_memory
@@ -104,7 +105,7 @@ def landmarks(seed: int, capacity: int, deferred: bool) -> Numbers:
         direction=belief.direction.at[: len(chosen)].set(where.directions[chosen]),
         descriptor=belief.descriptor.at[: len(chosen)].set(where.angles[chosen]),
     )
-    measurements = jax.tree.map(jnp.asarray, where.measurements)
+    measurements = on_device(where.measurements)
     before = memory_now()
     seconds = _fastest(_filter, config, deferred, town.params(), belief, measurements)
     return {
@@ -121,14 +122,14 @@ def scans(seed: int, count: int) -> Numbers:
     where = town.make(2, count, seed)
     config = town.config(CAPACITY)
     belief = init(config, jnp.asarray(where.truth[0], float))
-    measurements = jax.tree.map(jnp.asarray, where.measurements)
+    measurements = on_device(where.measurements)
     seconds = _fastest(_filter, config, False, town.params(), belief, measurements)
     return {"scans": count, "seconds": seconds, "peak_mb": peak_memory()}
 
 
 def trials(seed: int, count: int) -> Numbers:
     """Seconds of the filter over B trials of 200 scans past 32 known landmarks."""
-    drive = workload.as_floats(workload.rings(seed, count))
+    drive = workload.as_floats(workload.rings(seed, count), float)
     seconds = _fastest(workload.filter_drive, "standard", drive)
     return {"trials": count, "seconds": seconds, "peak_mb": peak_memory()}
 

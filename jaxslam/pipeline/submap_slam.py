@@ -33,6 +33,7 @@ from jaxslam.core.types import AnyArray, as_float64
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.belief import Belief
 from jaxslam.filtering.config import FilterConfig
+from jaxslam.filtering.inputs import check_inputs
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo, run_filter
 from jaxslam.filtering.submaps import Submap, begin_submap, close_submap
@@ -135,7 +136,8 @@ def update(
     if state.driven >= spec.max_distance or _is_full(config, state.belief):
         first = jax.tree.map(lambda x: x[0], measurements)
         seen = run_filter(config, params, state.belief, measurements)[1].pose[0]
-        ended = state._replace(belief=_predict(config, params, state.belief, first))
+        given = check_inputs(params, state.belief, first, over_time=False)
+        ended = state._replace(belief=_predict(config, given[0], state.belief, given[1]))
         state = close(config, spec, ended)
         assert state.joined is not None
         origin = se2_np.compose(state.joined.origins[-2], np.asarray(seen, float))

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from jaxslam.core import trace_cache
 from jaxslam.core.types import AnyArray, Array, as_count
@@ -211,14 +211,18 @@ def _normal_matrix(
 def _solve(matrix: sparse.csc_array, gradient: NumpyState) -> NumpyState:
     """Gauss-Newton step (T, 3) and (L, 2), from the normal matrix and half the gradient."""
     right = np.concatenate([-np.ravel(x) for x in gradient])
-    factors = splu(
+    step, poses = factorise(matrix).solve(right), gradient[0].size
+    return step[:poses].reshape(-1, 3), step[poses:].reshape(-1, 2)
+
+
+def factorise(matrix: sparse.csc_array) -> SuperLU:
+    """Factors of a symmetric, positive definite matrix, which `solve` and have a `shape`."""
+    return splu(
         matrix,
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    step, poses = factors.solve(right), gradient[0].size
-    return step[:poses].reshape(-1, 3), step[poses:].reshape(-1, 2)
 
 
 def _double(x: Array) -> np.ndarray:

@@ -23,6 +23,7 @@ from experiments import (
     cold_start,
     common,
     filter_benchmark,
+    growth,
     import_time,
     life_benchmark,
     peer_automata,
@@ -186,9 +187,16 @@ def profile(seed: int, num_trials: int, repeats: int) -> common.Numbers:
 
 
 def compute(
-    seed: int, num_trials: int, maps: int, drives: int, repeats: int, log: str, against: str
+    seed: int,
+    num_trials: int,
+    maps: int,
+    drives: int,
+    repeats: int,
+    log: str,
+    against: str,
+    with_growth: bool,
 ) -> common.Numbers:
-    """All numbers, by what they measure."""
+    """All numbers, by what they measure; `growth`, which takes minutes, where it is wanted."""
     of_starts = cold_start.compute(seed, log, against, repeats=1)
     of_chain, scans = chain(seed, num_trials, repeats)
     of_filter = filter_benchmark.compute(seed, drives, repeats, office=num_trials)
@@ -203,6 +211,7 @@ def compute(
         "front_end": frontend(scans, maps, repeats),
         "estimator": of_filter,
         "scan_matching": peer_matching.table(seed, MATCHED_SCANS, repeats),
+        "growth": growth.compute(seed) if with_growth else None,
     }
 
 
@@ -258,10 +267,11 @@ def bars(axis: Any, values: dict[str, float], form: str, title: str) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the benchmark."""
     pin()
-    sizes = {"runs": 4, "maps": 256, "drives": 512, "repeats": 3}
+    sizes = {"runs": 4, "maps": 256, "drives": 512, "repeats": 3, "growth": 1}
     args = common.parse(__doc__, argv, **sizes, log="", against="")
     numbers = compute(
-        *(args.seed, args.runs, args.maps, args.drives, args.repeats), args.log, args.against
+        *(args.seed, args.runs, args.maps, args.drives, args.repeats),
+        *(args.log, args.against, bool(args.growth)),
     )
     common.save(args.out, "benchmark", numbers, draw)
     of_chain, of_front, rows = numbers["chain"], numbers["front_end"], numbers["chain_profile"]
@@ -286,6 +296,8 @@ def main(argv: list[str] | None = None) -> int:
     ratio |= {name: numbers["estimator"][name] for name in ("filter_vs_c", "gradient_vs_filter")}
     print({name: x if x is None else round(x, 2) for name, x in ratio.items()})
     imports = {code: round(x, 2) for code, x in numbers["import_vs_jax"].items()}
+    if numbers["growth"]:
+        print("growth:", growth.summary(numbers["growth"]))
     print(f"processor time of imports, by that of `{import_time.JAX}`: {imports}")
     return 0
 

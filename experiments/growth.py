@@ -413,6 +413,13 @@ def draw(numbers: Numbers, path: Path) -> None:
     figure.savefig(path)
 
 
+def summary(numbers: Numbers) -> str:
+    """The figures of the town, the exponents and the cost of submaps as JSON."""
+    shown = {k: v for k, v in numbers["town"].items() if isinstance(v, (int, float))}
+    chosen = {"town": shown, "exponents": numbers["exponents"], "cost": numbers["cost"]}
+    return json.dumps(chosen)
+
+
 @common.report_errors(NAME)
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment; returns the exit code."""
@@ -426,8 +433,7 @@ def main(argv: list[str] | None = None) -> int:
         num_drives=args.drives,
     )
     common.save(args.out, NAME, numbers, draw)
-    shown = {k: v for k, v in numbers["town"].items() if isinstance(v, (int, float))}
-    print(json.dumps({"town": shown, "exponents": numbers["exponents"], "cost": numbers["cost"]}))
+    print(summary(numbers))
     return 0
 
 

@@ -142,7 +142,7 @@ def _is_below(limits: Array, index: np.ndarray, value: np.ndarray) -> Array:
     values = value.astype(limits.dtype)  # of NumPy: the functions below close over it
 
     def compare(limits: Array) -> Array:
-        return values < limits[index]
+        return jnp.less(values, limits[index])
 
     compared = custom_vmap(compare)
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxslam.core.batching import sequential_vmap_on_cpu
 from jaxslam.core.scan import Lidar, Scan
@@ -152,7 +153,7 @@ def segment_cells(
     Raises:
         ValueError: The ranges are not those of one scan of this lidar; while tracing.
     """
-    xy, of_beam = beam_ends(lidar, scan), segments.segment_of_beam
+    xy, of_beam = lax.stop_gradient(beam_ends(lidar, scan)), segments.segment_of_beam
     capacity, (height, width) = segments.valid.size, spec.shape
     is_last = jnp.arange(of_beam.size, dtype=jnp.int32) == of_beam.size - 1
     continues = (of_beam == jnp.roll(of_beam, -1)) & ~is_last

@@ -9,7 +9,7 @@ from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import inverse_transform
 from jaxslam.frontend import segmentation, segments
 from jaxslam.frontend.edge_codes import edge_code_bits, edge_codes
-from jaxslam.frontend.grid import Grid, GridSpec, cell_of
+from jaxslam.frontend.grid import Grid, GridSpec, cell_of, seen_free
 from jaxslam.frontend.lidar import beam_ends
 from jaxslam.frontend.segments import SegmentSpec
 from jaxslam.simulation import ray_casting, worlds
@@ -219,3 +219,21 @@ def test_edge_codes_want_the_grid_of_their_spec():
     cells = jnp.zeros((4, 5), bool)
     with pytest.raises(ValueError, match=r"grid.occupied is bool \(4, 5\), not bool \(82, 160\)"):
         jax.eval_shape(lambda: edge_codes(GridSpec(), Grid(cells, cells)))
+
+
+def test_what_is_drawn_is_constant_where_ranges_are_differentiated():
+    """Cells are integers: of a batch, too, a gradient passes them by."""
+    spec = GridSpec(cell_size=0.5)
+    scans = Scan(jnp.full((2, 361), 2.0), jnp.ones((2, 361), bool))
+    found = jax.vmap(lambda s: find_segments(SCANNER, SPEC, s))(scans)
+
+    def total(ranges):
+        def of_one(r, own, hit):
+            scan = Scan(r, hit)
+            drawn = segments.segment_cells(SCANNER, spec, scan, own)
+            free = seen_free(SCANNER, spec, scan)
+            return r.sum() + jnp.where(free | (drawn >= 0), r.dtype.type(1), r.dtype.type(0)).sum()
+
+        return jax.vmap(of_one)(ranges, found, scans.hit).sum()
+
+    np.testing.assert_array_equal(jax.jit(jax.grad(total))(scans.ranges), 1.0)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from jaxslam.core import se2_np
+from jaxslam.core.batching import on_device
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import CORNER
@@ -183,7 +184,7 @@ def make(blocks: int, num_scans: int, seed: int) -> Town:
         return jax.tree.map(lambda x: x if x.dtype.kind != "f" else x.astype(np.float32), fields)
 
     noise_free = features(exact, heading, angles[index])
-    q, r = _noise_of(params(), jnp.asarray(odometry, float), jax.tree.map(_on_device, noise_free))
+    q, r = _noise_of(params(), jnp.asarray(odometry, float), on_device(noise_free))
     polar = np.stack(
         [np.hypot(*np.moveaxis(exact, -1, 0)), np.arctan2(exact[..., 1], exact[..., 0])], -1
     )
@@ -195,7 +196,3 @@ def make(blocks: int, num_scans: int, seed: int) -> Town:
     measurements = Measurement(measured, features(xy, heading, angle))
     corner = np.where(valid, index, -1)
     return Town(corners, directions, angles, truth, measurements, corner)
-
-
-def _on_device(x: np.ndarray) -> jnp.ndarray:
-    return jnp.asarray(x, float if x.dtype.kind == "f" else None)

@@ -204,8 +204,7 @@ def _linearise(terms: Terms, state: State) -> tuple[np.ndarray, sparse.csc_array
     values, rows, columns, gradient = [], [], [], np.zeros(size)
     for i, (term, index) in enumerate(terms):
         residual, turn = _residual(term, origins[i], origins[i + 1], landmarks[index])
-        of_points = (first + 2 * index[:, None] + np.arange(2)).reshape(-1)
-        at = np.append(np.arange(3 * i - 3, 3 * i + 3), of_points)
+        at = np.append(np.arange(3 * i - 3, 3 * i + 3), first - 3 + point_rows(index))
         jacobian = _jacobian(term, residual, turn)
         if i == 0:  # its origin is known
             at, jacobian = at[3:], jacobian[:, 3:]

@@ -22,8 +22,6 @@ XLA_FLAGS = {
     "--xla_disable_hlo_passes": "cpu-parallel-task-assigner",
 }
 
-QUICK = {"xla_cpu_use_fusion_emitters": False}  # XLA's older code generator
-
 MAX_PROGRAMS = 12
 """Compiled programs that a process keeps, those used last.
 
@@ -119,7 +117,7 @@ class DeviceMap:
             size: Items of a batch, of a `BatchSize` those of the devices; a single one is not
                 vectorised.
             static: Number of leading arguments that are static under jit.
-            compile_quickly: Compile with `quick_options`, for large programs of small operations.
+            compile_quickly: As of `trace_cache.jit`.
 
         Raises:
             ValueError: `size` is below 1, or `static` below 0.
@@ -240,27 +238,6 @@ def _shapes(arrays: Any) -> Hashable:
     return tree, tuple(map(jax.typeof, leaves))
 
 
-@cache
-def quick_options() -> dict[str, Any]:
-    """Options of XLA with which large programs for CPUs compile in two thirds of the time.
-
-    They take XLA's older code generator for fused operations. What it compiles is equal to
-    rounding; gradients run a seventh slower, other programs two to three times.
-
-    Returns:
-        The options; none on other platforms, where this jaxlib does not know them, and where
-        XLA_FLAGS sets one.
-    """
-    present = os.environ.get("XLA_FLAGS", "")
-    if jax.default_backend() != "cpu" or any(name in present for name in QUICK):
-        return {}
-    try:
-        jax.jit(lambda: np.float32(0), compiler_options=QUICK).lower().compile()
-    except RuntimeError:  # an option that this jaxlib does not know
-        return {}
-    return QUICK
-
-
 @lru_cache(maxsize=MAX_PROGRAMS)
 def _runner(quick: bool, program: tuple, shapes: Hashable) -> trace_cache.CachedJit:
     """`_run`, jitted for one program; when it is dropped, what it has compiled is freed.
@@ -275,8 +252,7 @@ def _runner(quick: bool, program: tuple, shapes: Hashable) -> trace_cache.Cached
     def run(program: tuple, common: Any, items: Any) -> Any:
         return _run(program, common, items)
 
-    options = quick_options() if quick else None
-    return trace_cache.jit(run, static_argnames="program", compiler_options=options or None)
+    return trace_cache.jit(run, static_argnames="program", compile_quickly=quick)
 
 
 def _compile(

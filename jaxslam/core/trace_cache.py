@@ -48,7 +48,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache, update_wrapper
+from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -59,6 +59,7 @@ from jax import export
 from jax.sharding import SingleDeviceSharding
 
 from jaxslam.core.cache_limit import UNFINISHED, mark_used
+from jaxslam.core.quick_compilation import quick_options
 
 PACKAGE = __name__.split(".")[0]
 HOME = Path(__file__).parents[1]
@@ -109,15 +110,13 @@ class _Key(NamedTuple):
 class CachedJit:
     """A jitted function with a persistent trace; made by `jit`."""
 
-    def __init__(self, function: Callable, static: tuple[str, ...], options: dict | None = None):
+    def __init__(self, function: Callable, static: tuple[str, ...], quickly: bool = False):
         """Wrap a function, whose arguments with names in `static` are static."""
         self._function = function
         self._static = static
-        self._options = options
+        self._quickly = quickly
         self._signature = inspect.signature(function)
-        self._plain: jax.stages.Wrapped = jax.jit(
-            function, static_argnames=static, compiler_options=options
-        )
+        self._within: jax.stages.Wrapped = jax.jit(function, static_argnames=static)
         self._programs: dict[_Key, jax.stages.Wrapped | None] = {}
         update_wrapper(self, function)
 
@@ -148,8 +147,22 @@ class CachedJit:
 
         return compiled
 
+    @cached_property
+    def _plain(self) -> jax.stages.Wrapped:
+        """The function jitted by JAX, without a kept trace."""
+        if not self._quickly:
+            return self._within
+        return jax.jit(self._function, static_argnames=self._static, compiler_options=self._options)
+
+    @property
+    def _options(self) -> dict[str, Any] | None:
+        """Options of XLA; None if there are none."""
+        return (quick_options() if self._quickly else None) or None
+
     def _find(self, args: tuple, kwargs: dict) -> tuple[jax.stages.Wrapped, tuple, dict]:
         """Program for such arguments, jitted by JAX, and the arguments to call it with."""
+        if self._quickly and _within_another(args, kwargs):  # where JAX allows no options
+            return self._within, args, kwargs
         fallback = self._plain, args, kwargs
         folder = setting("jax_compilation_cache_dir")
         if not _enabled or folder is None or setting("jax_disable_jit"):
@@ -206,7 +219,7 @@ def jit(
     function: Callable,
     *,
     static_argnames: str | tuple[str, ...] = (),
-    compiler_options: dict[str, Any] | None = None,
+    compile_quickly: bool = False,
 ) -> CachedJit:
     """`jax.jit` with a trace that outlives the process; see the module's docstring.
 
@@ -218,11 +231,17 @@ def jit(
         function: A function of this package that depends on nothing but its arguments and the
             package's sources.
         static_argnames: Names of its static arguments.
-        compiler_options: Options of XLA for these programs, as `jax.jit` takes them; a function
-            with any cannot be called within other traced programs.
+        compile_quickly: Whether to compile with `quick_options`, which within other programs are
+            those of these.
     """
     names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
-    return CachedJit(function, tuple(names), compiler_options)
+    return CachedJit(function, tuple(names), compile_quickly)
+
+
+def _within_another(args: tuple, kwargs: dict) -> bool:
+    """Whether a function with such arguments is called while another is being traced."""
+    given = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((args, kwargs)))
+    return given or isinstance(jax.lax.full((), 0), jax.core.Tracer)
 
 
 def _common_device(leaves: list[Any]) -> jax.Device | None:

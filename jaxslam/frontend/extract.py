@@ -193,7 +193,7 @@ def extract_local_graph(config: FrontendConfig, scan: Scan) -> tuple[Features, L
     return features, arcs
 
 
-@partial(trace_cache.jit, static_argnames="config")
+@partial(trace_cache.jit, static_argnames="config", compile_quickly=True)
 def extract_local_graphs(config: FrontendConfig, scans: Scan) -> tuple[Features, LocalArcs]:
     """`extract_local_graph` of scans [T], `SCAN_BATCH` at a time to bound memory."""
     return map_batches(partial(extract_local_graph, config), scans, batch_size=SCAN_BATCH)

@@ -127,7 +127,7 @@ def first_history() -> MotionHistory:
         contradicted=jnp.zeros(()),
         usual_inliers=jnp.ones(()),
         wheel_scale=jnp.ones(()),
-        scale_information=jnp.full((), SCALE_STD**-2),
+        scale_information=jnp.full((), SCALE_STD**-2, float),
         wheels_reverse=jnp.zeros((), bool),
     )
 

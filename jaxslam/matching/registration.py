@@ -210,7 +210,7 @@ def _same_side(poses: Array, pose: Array, surfaces: OrientedPoints) -> Array:
     return side(poses[:, None, :2]) * side(pose[None, None, :2]) > 0.0
 
 
-@partial(trace_cache.jit, static_argnames=("spec", "scan_matching", "lidar"))
+@partial(trace_cache.jit, static_argnames=("spec", "scan_matching", "lidar"), compile_quickly=True)
 def register_batch(
     spec: LoopClosureSpec,
     scan_matching: ScanMatchSpec,

@@ -258,7 +258,7 @@ def _step(
     return FilterState(belief, arcs), info
 
 
-@partial(trace_cache.jit, static_argnames=("config", "lidar"))
+@partial(trace_cache.jit, static_argnames=("config", "lidar"), compile_quickly=True)
 def _steps(
     config: FilterConfig, lidar: Lidar, params: NoiseParams, state: FilterState, chunk: Chunk
 ) -> tuple[FilterState, StepInfo]:

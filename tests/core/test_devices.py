@@ -17,7 +17,6 @@ from jaxslam.core.devices import (
     DeviceMap,
     _queue,
     _runner,
-    quick_options,
     use_cpu_devices,
 )
 
@@ -237,19 +236,3 @@ def test_what_is_compiled_quickly_is_the_same_to_rounding():
 
 def wave(common, item):
     return jnp.sin(common * item) + jnp.exp(-item)
-
-
-def test_options_of_the_compiler_are_none_where_the_user_sets_them(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
-    quick_options.cache_clear()
-    assert quick_options() == {}
-    monkeypatch.undo()
-    quick_options.cache_clear()
-
-
-def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
-    monkeypatch.setattr(devices, "QUICK", {"xla_cpu_no_such_option": False})
-    quick_options.cache_clear()
-    assert quick_options() == {}
-    monkeypatch.undo()
-    quick_options.cache_clear()

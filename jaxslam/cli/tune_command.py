@@ -277,9 +277,12 @@ def _evaluate(
     evaluated = job.train if job.test is None else job.test
 
     def errors(params: NoiseParams) -> tuple[Metrics, ConsistencyReport | None]:
-        loss = fitting.values(job.config, params, evaluated, settings.loss)
+        asked = None if losses.comparisons(settings.loss) else settings.loss
+        results, statistics = filter_with_statistics(job.config, params, evaluated, loss=asked)
+        loss = statistics.loss
+        if loss is None:  # it compares two filters
+            loss = fitting.values(job.config, params, evaluated, settings.loss)
         numbers: Metrics = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
-        results, statistics = filter_with_statistics(job.config, params, evaluated)
         if evaluated.truth_mask is None or evaluated.truth_mask.any():
             numbers |= summary.evaluate(results)
         return numbers, slam_consistency(results, statistics)

@@ -9,6 +9,15 @@ import numpy as np
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}  # XLA's older code generator
 
+SHORT_WORK = 10_000
+"""Scans of a batch up to which front end and filter are compiled quickly: what then runs slower
+costs at most a third of the compile time that is saved."""
+
+
+def is_short(num_scans: int) -> bool:
+    """Whether so little is to be done that compiling it takes longer than doing it."""
+    return num_scans <= SHORT_WORK
+
 
 @cache
 def quick_options() -> dict[str, Any]:

@@ -11,6 +11,7 @@ The corrections are taken in the frame of the robot and whitened in the order he
 d = L w with L lower triangular. Directions that a step does not correct have no value.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -19,9 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.core import trace_cache
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.quick_compilation import is_short
 from jaxslam.core.se2 import rotation, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, nees, pose_error
@@ -51,34 +54,61 @@ class FilterStatistics(NamedTuple):
         dof: (T,) int32 its degrees of freedom; 0 where no feature updated the state.
         correction: (T, 3) whitened correction of the pose, components as `CORRECTIONS`.
         corrected: (T, 3) bool, components that have a value.
+        loss: () of the drive, if one was asked for.
     """
 
     nis: Array
     dof: Array
     correction: Array
     corrected: Array
+    loss: Array | None = None
 
 
 def filter_with_statistics(
-    config: Config, params: NoiseParams, episodes: Episode | list[Episode]
+    config: Config,
+    params: NoiseParams,
+    episodes: Episode | list[Episode],
+    *,
+    loss: Callable[[StepInfo, Episode], Array] | None = None,
 ) -> tuple[TrialResult, FilterStatistics]:
     """`filter_episodes`, and the statistics [B] for `slam_consistency`, in one program.
+
+    Args:
+        config: Of the filter.
+        params: Its noise parameters.
+        episodes: [B] drives, or a list of them.
+        loss: Of the infos [T] of a drive, and the drive; one of `tuning.losses`, for example.
 
     Raises:
         ValueError: As of `filter_episodes`.
     """
-    return _filter_batch(config.filter, *check_drives(config, params, episodes))
+    params, drives = check_drives(config, params, episodes)
+    run = _FILTER[is_short(drives.odometry.shape[0] * drives.odometry.shape[1])]
+    return run(config.filter, loss, params, drives)
 
 
-@partial(jax.jit, static_argnames="config")
 def _filter_batch(
-    config: FilterConfig, params: NoiseParams, episodes: Episode
+    config: FilterConfig,
+    loss: Callable[[StepInfo, Episode], Array] | None,
+    params: NoiseParams,
+    episodes: Episode,
 ) -> tuple[TrialResult, FilterStatistics]:
-    return map_batches(partial(_filter, config, params), episodes, batch_size=EPISODE_BATCH)
+    return map_batches(partial(_filter, config, loss, params), episodes, batch_size=EPISODE_BATCH)
+
+
+_FILTER = {
+    quickly: trace_cache.jit(
+        _filter_batch, static_argnames=("config", "loss"), compile_quickly=quickly
+    )
+    for quickly in (False, True)
+}
 
 
 def _filter(
-    config: FilterConfig, params: NoiseParams, episode: Episode
+    config: FilterConfig,
+    loss: Callable[[StepInfo, Episode], Array] | None,
+    params: NoiseParams,
+    episode: Episode,
 ) -> tuple[TrialResult, FilterStatistics]:
     """Result and statistics of one drive."""
     start = init(config, episode.truth[0])
@@ -91,7 +121,8 @@ def _filter(
         return belief, (info, *pose_correction(predicted, info))
 
     belief, (info, correction, corrected) = lax.scan(body, start, measurements)
-    statistics = FilterStatistics(info.nis, info.dof, correction, corrected)
+    value = None if loss is None else loss(info, episode)
+    statistics = FilterStatistics(info.nis, info.dof, correction, corrected, value)
     return trial_result(config, episode, belief, info), statistics
 
 

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxslam.core import trace_cache
 from jaxslam.core.batching import BatchSize, map_batches, traced_platform
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
+from jaxslam.core.quick_compilation import is_short
 from jaxslam.core.scan import Scan
 from jaxslam.core.types import Array, Key, as_count, as_size, check_type
 from jaxslam.frontend import extract
@@ -93,9 +95,6 @@ def drive_of(
     return TrialDrive(robot, walls, points, steps, life, matching)
 
 
-@partial(
-    jax.jit, static_argnames=("config", "robot", "num_scans", "noise_by_incidence", "matching")
-)
 def simulate_drives(
     keys: Key,
     config: FrontendConfig,
@@ -110,9 +109,10 @@ def simulate_drives(
 ) -> Episode:
     """Simulate one trial of `num_scans` scans for each of the keys (B,).
 
-    It is compiled for front end and scan matching alone, not for each filter.
+    It is compiled for front end and scan matching alone, not for each filter; quickly, where there
+    are few scans.
     """
-    return drives_and_scans(
+    return _DRIVES[is_short(keys.shape[0] * num_scans)](
         keys,
         config,
         robot,
@@ -148,6 +148,23 @@ def drives_and_scans(
         with_scans=with_scans,
     )
     return map_drives(lambda key: one(key, config, robot, world, path), keys)
+
+
+_DRIVES = {
+    quickly: trace_cache.jit(
+        drives_and_scans,
+        static_argnames=(
+            "config",
+            "robot",
+            "num_scans",
+            "noise_by_incidence",
+            "matching",
+            "with_scans",
+        ),
+        compile_quickly=quickly,
+    )
+    for quickly in (False, True)
+}
 
 
 def map_drives(simulate: Callable, items: Any) -> Any:

@@ -181,7 +181,7 @@ def test_an_interrupt_during_the_evaluation_says_where_the_noise_is(
     values = np.array([1.0]), np.full((1, 8), 0.5)
     monkeypatch.setattr(tune_command, "enable_caches", lambda: None)
     monkeypatch.setattr(fitting, "gradients_of", lambda *_: values)
-    monkeypatch.setattr(fitting, "values", stop)
+    monkeypatch.setattr(tune_command, "filter_with_statistics", stop)
     out = tmp_path / "out"
     assert main.main(["tune", str(drives), "--updates", "2", "--out", str(out)]) == 130
     line = capsys.readouterr().err.splitlines()[-1]

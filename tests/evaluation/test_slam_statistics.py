@@ -13,6 +13,7 @@ from jaxslam.filtering.config import init
 from jaxslam.filtering.motion_model import odometry_cov
 from jaxslam.pipeline.episodes import episode_from_arrays
 from jaxslam.pipeline.stacking import stack_episodes
+from jaxslam.tuning import fitting, losses
 
 LANDMARKS = np.array([[3.0, 1.0], [-2.5, 3.0], [0.5, -2.5], [0.0, 5.0]])
 CONFIG = Config.for_landmark_sensor(4, 2)
@@ -63,6 +64,12 @@ def test_results_are_those_of_the_filter_alone(drives, correct):
     alone = filter_episodes(CONFIG, PARAMS, drives)
     for name, mine, theirs in zip(alone._fields, correct[0], alone, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_its_loss_is_that_which_is_tuned(drives):
+    loss = filter_with_statistics(CONFIG, PARAMS, drives, loss=losses.pose_nll)[1].loss
+    expected = fitting.values(CONFIG, PARAMS, drives, losses.pose_nll)
+    np.testing.assert_allclose(loss, expected, rtol=1e-9)
 
 
 def test_a_filter_whose_noise_is_that_of_its_drives_is_consistent(correct):

@@ -47,6 +47,15 @@ def matches_of(scans, odometry):
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
+def test_the_first_submap_has_the_types_of_all_later_ones(drive):
+    """With another weak type the matcher would be compiled once more, for the first chunk alone."""
+    scans, first = item(drive[1], slice(CHUNK)), empty_submap(SPEC, LIDAR)
+    run = partial(match_scans, SPEC, LIDAR)
+    later = jax.eval_shape(run, first, scans, jnp.zeros((CHUNK, 3)))[0]
+    types = [jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), x) for x in (first, later)]
+    assert types[0] == types[1]
+
+
 def test_increments_of_slipping_wheels_are_corrected(drive):
     poses, scans = drive
     true = np.asarray(odometry_of(poses))

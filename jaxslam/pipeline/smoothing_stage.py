@@ -27,7 +27,9 @@ CLOSURE_CONVERGED = 0.3  # [m] the search ends when no pose has moved further th
 PADDING_MULTIPLE = 512
 
 _build_problem = trace_cache.jit(
-    smoothing_problem.build_problem, static_argnames=("untrusted_inflation", "noise_model")
+    smoothing_problem.build_problem,
+    static_argnames=("untrusted_inflation", "noise_model"),
+    compile_quickly=True,
 )
 
 

@@ -26,6 +26,8 @@ References:
     iteratively reweighted least-squares.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,7 +65,7 @@ Blocks = tuple[np.ndarray, np.ndarray, AnyArray]
 Rows = tuple[Jacobian, LoopClosureRows | None]
 """Reweighted Jacobian, NumPy, and that of the loop closures if there are any."""
 
-_whitened = trace_cache.jit(whitened, static_argnames="num_landmarks")
+_whitened = trace_cache.jit(whitened, static_argnames="num_landmarks", compile_quickly=True)
 _wrapped = trace_cache.jit(wrap_state)
 
 
@@ -146,7 +148,7 @@ def smooth_log(
     return SmoothingResult(*state, np.array(costs))
 
 
-@trace_cache.jit
+@partial(trace_cache.jit, compile_quickly=True)
 def _evaluate(
     scale: Array, problem: WhitenedProblem, state: arrowhead.State
 ) -> tuple[Array, arrowhead.State, Jacobian]:

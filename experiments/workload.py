@@ -81,6 +81,9 @@ def dead_reckoning(first: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     return np.concatenate([first[:, None, :2] + np.cumsum(step, axis=1), heading[..., None]], -1)
 
 
+TOGETHER = 32  # trials whose landmarks are sorted together
+
+
 def nearest(
     truth: np.ndarray, positions: np.ndarray, within: tuple[float, float], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,6 +95,20 @@ def nearest(
         within: [m] least and largest range.
         count: Number of landmarks in a step at most.
     """
+    positions = np.broadcast_to(positions, (len(truth), *positions.shape[1:]))
+    shape = *truth.shape[:2], count
+    distance, bearing, index = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
+    for k in range(0, len(truth), TOGETHER):
+        some = slice(k, k + TOGETHER)
+        found = _nearest(truth[some], positions[some], within, count)
+        distance[some], bearing[some], index[some] = found
+    return distance, bearing, index
+
+
+def _nearest(
+    truth: np.ndarray, positions: np.ndarray, within: tuple[float, float], count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`nearest` of a few trials, as its arrays of all landmarks at all poses are large."""
     offset = positions[:, None] - truth[:, :, None, :2]
     distance = np.linalg.norm(offset, axis=-1)
     visible = (distance > within[0]) & (distance < within[1])
@@ -134,8 +151,9 @@ def rings(
     q = odometry_scale * np.array([0.02, 0.02, 0.01])
     r = sensor_scale * np.array([0.10, 0.03])
     distance, bearing, ids = nearest(truth, positions, (0.4, 6.0), 8)
-    exact = np.stack([distance, bearing], axis=-1)
-    range_bearing = exact + r * rng.normal(size=exact.shape)
+    range_bearing = np.stack([distance, bearing], axis=-1)
+    noise = rng.normal(size=range_bearing.shape)
+    range_bearing += np.multiply(r, noise, out=noise)
     ids = np.where(range_bearing[..., 0] > 0.4, ids, -1)
     return Drive(
         truth=truth,

@@ -181,20 +181,27 @@ def print_table(rows: list[dict[str, Any]], given: Numbers) -> None:
 def draw(axis: Any, rows: list[dict[str, Any]], given: Numbers) -> None:
     """Draw the roofs, and a point for each part that is none of another, on logarithmic axes."""
     found = [row for row in rows if row["intensity"] and ":" not in row["part"]]
-    found.sort(key=lambda row: row["intensity"])
     peak = given["flops_per_s"]
-    first = found[0]["intensity"] / 10 if found else 0.1
-    last = 3 * peak / given["memory_bytes_per_s"]
+    first = min((row["intensity"] for row in found), default=1.0) / 10
+    last = max([3 * peak / given["memory_bytes_per_s"], *(2 * row["intensity"] for row in found)])
     for kind, colour in (("cache", common.ORANGE), ("memory", common.BLUE)):
         speed = given[f"{kind}_bytes_per_s"]
-        line = [first, peak / speed, max(last, 2 * found[-1]["intensity"] if found else 0.0)]
+        line = [first, peak / speed, last]
         roof = [min(peak, speed * x) / 1e9 for x in line]
         axis.plot(line, roof, color=colour, label=kind)
-    for k, row in enumerate(found):
+    found.sort(key=lambda row: row["flops_per_s"])
+    for k, row in enumerate(found):  # names beside the axes, where they cannot overlap
         at = row["intensity"], row["flops_per_s"] / 1e9
         axis.plot(*at, ".", color=common.BLACK)
-        side = {"ha": "left", "va": "top"} if k % 2 else {"ha": "right", "va": "bottom"}
-        axis.annotate(f" {row['part'].replace('_', ' ')} ", at, fontsize=7, **side)
+        axis.annotate(
+            row["part"].replace("_", " "),
+            at,
+            xytext=(1.03, (k + 0.5) / len(found)),
+            textcoords="axes fraction",
+            fontsize=7,
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": common.BLACK, "linewidth": 0.5},
+        )
     axis.set(xscale="log", yscale="log", xlabel="operations a byte", ylabel="Gflop/s")
-    axis.legend(fontsize=7, loc="lower right", frameon=False)
+    axis.legend(fontsize=7, loc="upper left", frameon=False)
     axis.set_title("one core: roofline, and the parts of the chain", fontsize=10)

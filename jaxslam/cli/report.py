@@ -28,6 +28,9 @@ from jaxslam.pipeline.results import SlamResult
 from jaxslam.pipeline.saving import to_saved_map
 from jaxslam.simulation.worlds import World
 
+# One program, not one for each of its operations.
+_beam_ends = jax.jit(jax.vmap(lidar.beam_ends, in_axes=(None, 0)), static_argnums=0)
+
 
 def write_results(
     out_dir: Path,
@@ -194,10 +197,10 @@ def draw(
     if world is not None:
         maps.draw_walls(axis, world)
     if scans is not None:
-        points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, scans)
+        points = _beam_ends(config.frontend.lidar, scans)
         maps.draw_hits(axis, poses[result.keyframes], np.asarray(points), np.asarray(scans.hit))
     if saved_scans is not None and result.saved_poses is not None:
-        points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(config.frontend.lidar, saved_scans)
+        points = _beam_ends(config.frontend.lidar, saved_scans)
         hit = np.asarray(saved_scans.hit)
         maps.draw_hits(axis, result.saved_poses, np.asarray(points), hit)
     breaks = np.flatnonzero(np.diff(result.piece)) + 1  # across which no line is drawn

@@ -143,7 +143,7 @@ def write(
     config = config._replace(  # the map has grown to its size, which the files are made for
         filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)
     )
-    of_keyframes = jax.tree.map(lambda x: x[result.keyframes], scans)
+    of_keyframes = jax.tree.map(lambda x: np.asarray(x)[result.keyframes], scans)
     times = np.concatenate([drive.log.times for drive in context.drives])[result.keyframes]
     report.write_maps(
         out_dir,

@@ -13,8 +13,8 @@ from jaxslam.core.types import as_count
 GC_THRESHOLD = 100_000
 """Threshold of the garbage collector: net new objects between two collections."""
 
-MIN_COMPILE_SECONDS = 0.1
-"""Only programs that take this long to compile are kept."""
+MIN_COMPILE_SECONDS = 0.01
+"""Only programs that take this long to compile are kept; reading one takes some milliseconds."""
 
 MAX_BYTES = 2**30
 """Limit of the folder of both caches; programs of a command take 2 to 7 MB."""

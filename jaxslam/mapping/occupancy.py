@@ -1,5 +1,6 @@
 """Occupancy map of scans at known poses."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,9 @@ MAX_GAP = 0.2  # [m] between two beams that pass beside a cell, so that it is fr
 BETWEEN = (-0.25, 0.0, 0.25)  # of the angle between two beams, where space is free between them
 BATCH = 128  # scans at a time
 MARGIN = 0.5  # [m] of unknown cells around the map
+
+# One program, not one for each of its operations.
+_beam_angles = jax.jit(beam_angles, static_argnums=0)
 
 
 def occupancy_map(
@@ -55,7 +59,7 @@ def occupancy_map(
     if not finite.any():
         raise ValueError("poses: no pose is finite")
     scan_poses, ranges, hit = scan_poses[finite], ranges[finite], hit[finite]
-    angle = scan_poses[:, 2:] + np.asarray(beam_angles(lidar), np.float64)
+    angle = scan_poses[:, 2:] + np.asarray(_beam_angles(lidar), np.float64)
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (T, R, 2)
     ends = scan_poses[:, None, :2] + ranges[..., None] * directions
     low, size, resolution = _extent(np.concatenate([ends[hit], scan_poses[:, :2]]), resolution)

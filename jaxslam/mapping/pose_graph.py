@@ -21,6 +21,9 @@ from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.matching.loop_closure import LoopClosures
 from jaxslam.smoothing.problem import ODOMETRY_STD_FLOOR
 
+# One program, not one for each of its operations.
+_confirmed = jax.jit(confirmed, static_argnums=0)
+
 
 class PoseGraph(NamedTuple):
     """Poses (T,), landmarks (L,), and the factors between them.
@@ -103,7 +106,7 @@ def build_pose_graph(
         ValueError: An argument is of another type, or their numbers of scans differ.
     """
     poses = _checked(config, poses, belief, info, measurements)
-    kept = np.asarray(confirmed(config, belief) & (belief.kind != WALL))
+    kept = np.asarray(_confirmed(config, belief)) & (np.asarray(belief.kind) != WALL)
     landmark_ids, feature_ids = np.asarray(belief.id)[kept], np.asarray(info.id)
     scan, feature = np.nonzero(np.isin(feature_ids, landmark_ids) & (feature_ids >= 0))
     index = {landmark: k for k, landmark in enumerate(landmark_ids.tolist())}

@@ -22,6 +22,9 @@ from jaxslam.pipeline.results import SlamResult
 OdometrySource = Literal["scan", "scans-only", "wheels"]
 """Scan matching fused with wheel odometry, scan matching alone, or wheel odometry alone."""
 
+# One program, not one for each of its operations.
+_to_scan = jax.jit(lidar.to_scan, static_argnums=0)
+
 
 class LogInput(NamedTuple):
     """What `run_slam` needs of a log of T scans.
@@ -76,7 +79,7 @@ def from_laser_log(laser_log: LaserLog, source: OdometrySource = "scan") -> LogI
     config.check()
     odom_poses = relative(laser_log.odom_poses[0], laser_log.odom_poses)
     odometry = arguments.as_log_odometry(increments(odom_poses))
-    scans = lidar.to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
+    scans = _to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
     arguments.as_scans(config.frontend.lidar, laser_log.ranges, len(odometry))
     guessed = laser_log.odometry_guessed
     return LogInput(

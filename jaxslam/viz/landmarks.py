@@ -3,6 +3,7 @@
 Landmarks differ in shape as well as in colour.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +22,9 @@ from jaxslam.viz.maps import draw_markers
 
 # Marker, colour and legend name of each kind of landmark that has a position.
 LANDMARK_STYLES = {JUNCTION: ("o", GREEN, "junction"), CORNER: ("s", ORANGE, "corner")}
+
+# One program, not one for each of its operations.
+_slot_blocks = jax.jit(slot_blocks)
 
 
 def draw_ellipses(axis: Axes, xy: AnyArray, cov: AnyArray, color: str) -> None:
@@ -64,7 +68,7 @@ def draw_landmarks(axis: Axes, belief: Belief, *, confirm_count: int) -> None:
         confirm_count: Least number of observations of a landmark.
     """
     count, kind = np.asarray(belief.num_seen), np.asarray(belief.kind)
-    position, cov = np.asarray(belief.landmark_positions), np.asarray(slot_blocks(belief.map_cov))
+    position, cov = np.asarray(belief.landmark_positions), np.asarray(_slot_blocks(belief.map_cov))
     for drawn in LANDMARK_STYLES:
         use = (count >= confirm_count) & (kind == drawn)
         _draw_landmarks(axis, position[use], cov[use], drawn)

@@ -52,7 +52,7 @@ def choose_window(
     *,
     min_shared: int,
 ) -> np.ndarray:
-    """The submaps fewest steps from one of them, and those on the way to others.
+    """The submaps fewest steps from one of them, and those that the steps to others lead over.
 
     Args:
         landmark_index: Of each submap the indices (n,) of its landmarks.

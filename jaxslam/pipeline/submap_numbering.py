@@ -17,8 +17,9 @@ from jaxslam.core import se2_np
 from jaxslam.core.types import as_count, as_size
 from jaxslam.filtering.data_association import AssociationSpec
 from jaxslam.filtering.submaps import Submap
-from jaxslam.smoothing.submap_joining import JoinedSubmaps, relative_poses
+from jaxslam.smoothing.submap_joining import JoinedSubmaps
 from jaxslam.smoothing.submap_matching import match_submaps
+from jaxslam.smoothing.submap_window import choose_window, relative_poses_in
 
 
 class SubmapSpec(NamedTuple):
@@ -30,6 +31,7 @@ class SubmapSpec(NamedTuple):
         search_distance: [m] within which landmarks of the estimated map make a submap a candidate.
         min_matches: Matches with a submap below which there are none.
         max_iterations: Gauss-Newton steps at each closing; the end of `run_submaps` takes more.
+        window: Submaps around a closed one that alone are solved at first.
     """
 
     max_distance: float = 20.0
@@ -37,14 +39,29 @@ class SubmapSpec(NamedTuple):
     search_distance: float = 2.0
     min_matches: int = 3
     max_iterations: int = 1
+    window: int = 24
 
 
 def check_submap_spec(spec: SubmapSpec) -> None:
     """Raise ValueError, naming the field, unless all are positive."""
     for name in ("max_distance", "search_distance"):
         as_size(f"spec.{name}", getattr(spec, name), positive=True)
-    for name in ("max_candidates", "min_matches", "max_iterations"):
+    for name in ("max_candidates", "min_matches", "max_iterations", "window"):
         as_count(f"spec.{name}", getattr(spec, name))
+
+
+class Numbered(NamedTuple):
+    """Landmarks of N + 1 submaps, of which N are joined.
+
+    Attributes:
+        landmark_index: For each of the N + 1 the indices (n,) 0..L-1.
+        positions: (L, 2) [m] a guess of the landmarks.
+        window: (W,) int those of the N submaps that are around the new one.
+    """
+
+    landmark_index: tuple[np.ndarray, ...]
+    positions: np.ndarray
+    window: np.ndarray
 
 
 def number_landmarks(
@@ -53,7 +70,7 @@ def number_landmarks(
     submaps: Sequence[Submap],
     landmark_index: Sequence[np.ndarray],
     joined: JoinedSubmaps,
-) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+) -> Numbered:
     """Indices of the landmarks of N + 1 submaps, of which N are joined, and their positions.
 
     Args:
@@ -62,14 +79,21 @@ def number_landmarks(
         submaps: N + 1 submaps.
         landmark_index: For each of the first N the index (n,) of its landmarks in `joined`.
         joined: The first N, joined.
-
-    Returns:
-        For each of the N + 1 the indices (n,) 0..L-1, and a guess of the positions (L, 2) [m].
     """
     submap, num_known = submaps[-1], len(joined.landmark_positions)
     positions = se2_np.transform(joined.origins[-1], submap.positions)
     candidates = _candidates(spec, landmark_index, joined, positions)
-    relative, cov = relative_poses(joined, candidates, len(landmark_index))
+    window = choose_window(
+        landmark_index,
+        num_known,
+        len(landmark_index) - 1,
+        candidates,
+        spec.window,
+        min_shared=spec.min_matches,
+    )
+    relative, cov = relative_poses_in(
+        window, submaps, landmark_index, joined, candidates, len(landmark_index)
+    )
     index = np.full(len(positions), -1)
     label = np.arange(num_known)  # of each landmark of the map, as some become one
     for at in np.argsort(np.trace(cov, axis1=1, axis2=2), kind="stable"):
@@ -95,7 +119,7 @@ def number_landmarks(
     whole = np.concatenate([label, index[fresh]])
     kept, label = np.unique(whole, return_inverse=True)
     guess = np.concatenate([joined.landmark_positions, positions[fresh]])[kept]
-    return tuple(label[one] for one in (*landmark_index, index)), guess
+    return Numbered(tuple(label[one] for one in (*landmark_index, index)), guess, window)
 
 
 def _candidates(

@@ -6,7 +6,9 @@ submap runs, which takes the same time wherever the robot is. When the robot has
 
     close       the Gaussian of its last pose and its landmarks (`filtering.submaps`)
     number      its landmarks, by matches with those of other submaps (`submap_numbering`)
-    join        all submaps: poses of their frames, and landmarks (`smoothing.submap_joining`)
+    join        poses of frames, and landmarks: of the submaps around (`smoothing.submap_window`);
+                of all, where a loop closes, and in the end (`smoothing.submap_gate`), without
+                matches that the rest contradicts
     begin       the next submap, at the pose of its first scan
 
 Until a submap is closed it does not profit from those before: `online_poses` drift by what the
@@ -38,10 +40,13 @@ from jaxslam.filtering.noise import NoiseParams
 from jaxslam.filtering.slam_filter import StepInfo, run_filter
 from jaxslam.filtering.submaps import Submap, begin_submap, close_submap
 from jaxslam.pipeline.submap_numbering import SubmapSpec, check_submap_spec, number_landmarks
-from jaxslam.smoothing.submap_joining import JoinedSubmaps, join_submaps
+from jaxslam.smoothing.submap_gate import join_consistent
+from jaxslam.smoothing.submap_joining import JoinedSubmaps
+from jaxslam.smoothing.submap_window import choose_window, join_in_window
 
 CHUNK = 20  # scans that one call of the filter's program takes
-
+RESOLVED = 1.2  # times as many submaps as when all were solved last: all are solved again
+WIDENED = 4  # times as many submaps, where a window is too small
 
 DEFAULT = SubmapSpec()
 
@@ -57,6 +62,7 @@ class SubmapState(NamedTuple):
         submaps: Those that are closed.
         landmark_index: For each of them the index (n,) of its landmarks in `joined`.
         joined: Those that are closed, joined; None while there is none.
+        num_solved: Number of submaps when all of them were solved last.
     """
 
     belief: Belief
@@ -66,6 +72,7 @@ class SubmapState(NamedTuple):
     submaps: tuple[Submap, ...]
     landmark_index: tuple[np.ndarray, ...]
     joined: JoinedSubmaps | None
+    num_solved: int
 
 
 class SubmapResult(NamedTuple):
@@ -97,7 +104,7 @@ def init(config: FilterConfig, start: AnyArray) -> SubmapState:
         ValueError: As of `begin_submap`, or `start` is no pose.
     """
     start = as_float64("start", start, (3,))
-    return SubmapState(begin_submap(config), start, 0.0, start, (), (), None)
+    return SubmapState(begin_submap(config), start, 0.0, start, (), (), None, 0)
 
 
 def update(
@@ -161,26 +168,69 @@ def _predict(
 def close(config: FilterConfig, spec: SubmapSpec, state: SubmapState) -> SubmapState:
     """Close the open submap, join it with the others, and begin the next."""
     submap = close_submap(config, state.belief)
-    joined, submaps = state.joined, (*state.submaps, submap)
-    if joined is None:
+    submaps, previous = (*state.submaps, submap), state.joined
+    if previous is None:
         origins = state.start[None]
         landmark_index: tuple[np.ndarray, ...] = (np.arange(len(submap.positions)),)
-        positions = se2_np.transform(state.start, submap.positions)
+        positions, window = se2_np.transform(state.start, submap.positions), np.arange(0)
     else:
-        origins = joined.origins
-        landmark_index, positions = number_landmarks(
-            config.association, spec, submaps, state.landmark_index, joined
+        origins = previous.origins
+        landmark_index, positions, window = number_landmarks(
+            config.association, spec, submaps, state.landmark_index, previous
         )
-    joined = join_submaps(
-        submaps,
-        landmark_index,
-        np.concatenate([origins, se2_np.compose(origins[-1], submap.last_pose)[None]]),
-        positions,
-        previous=joined,
-        max_iterations=spec.max_iterations,
-    )
+    origins = np.concatenate([origins, se2_np.compose(origins[-1], submap.last_pose)[None]])
+    joined, num_solved = None, state.num_solved
+    if previous is not None and len(submaps) < RESOLVED * num_solved:
+        joined = _join_nearby(spec, submaps, landmark_index, origins, positions, previous, window)
+    if joined is None:
+        num_solved = len(submaps)
+        joined, landmark_index = join_consistent(
+            submaps,
+            landmark_index,
+            origins,
+            positions,
+            previous=previous,
+            max_iterations=spec.max_iterations,
+        )
     begun = begin_submap(config)
-    return SubmapState(begun, joined.origins[-1], 0.0, state.start, submaps, landmark_index, joined)
+    return SubmapState(
+        begun, joined.origins[-1], 0.0, state.start, submaps, landmark_index, joined, num_solved
+    )
+
+
+def _join_nearby(
+    spec: SubmapSpec,
+    submaps: tuple[Submap, ...],
+    landmark_index: tuple[np.ndarray, ...],
+    origins: np.ndarray,
+    positions: np.ndarray,
+    previous: JoinedSubmaps,
+    window: np.ndarray,
+) -> JoinedSubmaps | None:
+    """All submaps, of which only those around the last are solved; None if that does not do."""
+    size = spec.window
+    while len(window) < len(submaps) - 1:
+        joined = join_in_window(
+            window,
+            submaps,
+            landmark_index,
+            origins,
+            positions,
+            previous,
+            max_iterations=spec.max_iterations,
+        )
+        if joined is not None or size > len(submaps) / 2:
+            return joined
+        size *= WIDENED
+        window = choose_window(
+            landmark_index[:-1],
+            len(positions),
+            len(submaps) - 2,
+            window,
+            size,
+            min_shared=spec.min_matches,
+        )
+    return None
 
 
 def run_submaps(
@@ -194,8 +244,9 @@ def run_submaps(
 ) -> SubmapResult:
     """SLAM in submaps over one log.
 
-    The time of a scan does not depend on the size of the map, but that of joining does: with N
-    submaps it is about proportional to N for each closing. Memory is proportional to N.
+    The time of a scan does not depend on the size of the map, and that of a closing hardly does:
+    only the submaps around are solved, or all, where that does not explain the new one. Memory is
+    proportional to the number of submaps.
 
     Args:
         config: Configuration of the filter; `max_landmarks` is the capacity of one submap.
@@ -231,7 +282,7 @@ def run_submaps(
     state = close(config, spec, state)
     joined = state.joined
     assert joined is not None  # the last scan closes a submap
-    joined = join_submaps(
+    joined, landmark_index = join_consistent(
         state.submaps,
         state.landmark_index,
         joined.origins,
@@ -245,7 +296,7 @@ def run_submaps(
         submap=number,
         landmark_id=np.concatenate(ids),
         submaps=state.submaps,
-        landmark_index=state.landmark_index,
+        landmark_index=landmark_index,
         joined=joined,
     )
 

@@ -28,6 +28,41 @@ def test_a_town_is_driven_as_its_poses_say_and_its_corners_are_seen_as_they_are(
     assert 0.008 < increments[1:, 0].std() < 0.012  # 0.02 m / sqrt(m) over 0.25 m
 
 
+def test_what_was_stopped_goes_on_and_ends_in_the_same_figures(tmp_path, monkeypatch):
+    """Each figure is drawn anew where it is computed, so none may be computed twice."""
+
+    def figures(stop_at, folder, counts):
+        cache = growth.common.ResultCache(folder, 0)
+
+        def town_of(*_):
+            counts.append("town")
+            return {"seconds_exponent": len(counts), "memory_exponent": 1.0, "progress": []}
+
+        def run(task, _, arguments, *, module):
+            if len(counts) == stop_at:
+                raise KeyboardInterrupt
+            counts.append((task, *arguments.values()))
+            number = 1.5 * len(counts)
+            one = {"landmark_rmse_m": number, "landmarks": 3}
+            return {
+                **dict.fromkeys(("landmarks", "scans", "trials"), number),
+                **dict.fromkeys(("ms_per_scan", "covariance_mb", "seconds"), number**2),
+                **({"one_map": one, "submaps": one} if task == "accuracy" else {}),
+            }
+
+        monkeypatch.setattr(growth, "in_town", town_of)
+        return growth.compute(0, largest=128, num_drives=3, run=run, keep=cache)
+
+    counts: list = []
+    for stop_at in (1, 3, 9, 13):
+        with pytest.raises(KeyboardInterrupt):
+            figures(stop_at, tmp_path / "parts", counts)
+        assert len(counts) == stop_at
+    resumed, whole = figures(-1, tmp_path / "parts", counts), figures(-1, tmp_path / "own", [])
+    assert json.dumps(resumed) == json.dumps(whole)
+    assert len(counts) == len(set(counts)) == 1 + 4 + 4 + 3 + 3
+
+
 @pytest.mark.slow
 def test_figures_of_a_small_town(tmp_path, monkeypatch):
     """No corner is taken for another, and submaps do not cost more than their bound."""

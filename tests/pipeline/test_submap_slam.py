@@ -99,6 +99,30 @@ def test_errors_are_those_of_the_filter_with_one_map(results, all_drives):
     assert poses < 1.3 * poses_of_filter
 
 
+def test_submaps_that_are_solved_by_their_surroundings_are_one_map_in_the_end():
+    """Windows of three submaps and all submaps at each closing lead to the same map."""
+    _, measurements = drives(jax.random.key(3), count=1, steps=320)
+    measurements = take(measurements._replace(landmark_ids=None), 0)
+    found, solved = [], []
+    for window in (3, 100):
+        of_window: list[tuple[int, int]] = []
+
+        def follow(_, state, of_window=of_window):
+            of_window.append((len(state.submaps), state.num_solved))
+
+        spec = SPEC._replace(window=window)
+        run = run_submaps(FILTER, PARAMS, START, measurements, spec=spec, callback=follow)
+        found.append(run)
+        solved.append(np.array(of_window))
+    assert np.all(solved[1][:, 0] == solved[1][:, 1])
+    assert np.count_nonzero(solved[0][:, 0] > solved[0][:, 1]) > 4
+    for one, other in zip(found[0].landmark_index, found[1].landmark_index, strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(found[0].poses, found[1].poses, atol=1e-4)
+    online = np.linalg.norm((found[0].online_poses - found[1].online_poses)[:, :2], axis=1)
+    assert online.max() < 0.05
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -106,6 +130,7 @@ def test_errors_are_those_of_the_filter_with_one_map(results, all_drives):
         ({"search_distance": -1.0}, "spec.search_distance is -1.0"),
         ({"max_candidates": 0}, "spec.max_candidates is 0"),
         ({"min_matches": 0.5}, "spec.min_matches is 0.5"),
+        ({"window": 0}, "spec.window is 0"),
     ],
 )
 def test_wrong_numbers_are_refused(all_drives, change, message):

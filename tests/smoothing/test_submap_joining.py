@@ -8,7 +8,8 @@ from scipy.stats import chi2
 from jaxslam.core import se2_np
 from jaxslam.core.types import CORNER
 from jaxslam.filtering.submaps import Submap
-from jaxslam.smoothing.submap_joining import STD_FLOOR, join_submaps, relative_poses
+from jaxslam.smoothing.submap_joining import join_submaps, relative_poses
+from jaxslam.smoothing.submap_terms import STD_FLOOR
 
 ORIGINS = np.array([[0.5, 0.2, 2.9], [-4.0, 2.0, -2.2], [-6.0, -2.0, -0.7], [-1.0, -2.5, 0.4]])
 LANDMARKS = np.array(

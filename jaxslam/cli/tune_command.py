@@ -279,9 +279,10 @@ def _evaluate(
     def errors(params: NoiseParams) -> tuple[Metrics, ConsistencyReport | None]:
         asked = None if losses.comparisons(settings.loss) else settings.loss
         results, statistics = filter_with_statistics(job.config, params, evaluated, loss=asked)
-        loss = statistics.loss
-        if loss is None:  # it compares two filters
+        if statistics.loss is None:  # it compares two filters
             loss = fitting.values(job.config, params, evaluated, settings.loss)
+        else:
+            loss = np.asarray(statistics.loss)
         numbers: Metrics = {"loss": float(np.mean(loss[np.isfinite(loss)]))}
         if evaluated.truth_mask is None or evaluated.truth_mask.any():
             numbers |= summary.evaluate(results)

@@ -26,8 +26,7 @@ import numpy as np
 from jaxslam.core.types import AnyArray
 from jaxslam.filtering.submaps import Submap
 from jaxslam.smoothing.submap_joining import JoinedSubmaps, join_submaps
-from jaxslam.smoothing.submap_terms import Term, make_terms, residual_of
-from jaxslam.smoothing.submap_window import times_held
+from jaxslam.smoothing.submap_terms import Term, make_terms, residual_of, times_held
 
 IMPROBABLE = 1e-6
 """Probability that a right match, or right matches with one submap, are taken back."""

@@ -43,6 +43,7 @@ from jaxslam.smoothing.submap_terms import (
     make_terms,
     moved,
     place_others,
+    times_held,
 )
 
 
@@ -102,7 +103,10 @@ def join_submaps(
     origins = as_float64("origins", origins, (num_submaps + 1, 3))
     positions = as_float64("landmark_positions", landmark_positions, ("L", 2))
     max_iterations = as_count("max_iterations", max_iterations)
-    times = _times_held(submaps, landmark_index, len(positions))
+    _check_index(submaps, landmark_index, len(positions))
+    times = times_held(landmark_index, len(positions))
+    if len(times) and times.min() == 0:
+        raise ValueError(f"landmark {times.argmin()} is in no submap")
     known = () if previous is None else previous.restricted
     terms = make_terms(submaps, landmark_index, range(num_submaps), times > 1, known)
     columns = columns_of(np.arange(num_submaps + 1) > 0, times > 1)
@@ -114,11 +118,10 @@ def join_submaps(
     return JoinedSubmaps(state[0], positions, np.array(costs), dof, factors, restricted)
 
 
-def _times_held(
+def _check_index(
     submaps: Sequence[Submap], landmark_index: Sequence[np.ndarray], num_landmarks: int
-) -> np.ndarray:
-    """Number (L,) of submaps that hold each landmark; ValueError where an index is wrong."""
-    times = np.zeros(num_landmarks, int)
+) -> None:
+    """Raise ValueError where an index of a landmark is wrong."""
     for i, (submap, index) in enumerate(zip(submaps, landmark_index, strict=True)):
         if np.shape(index) != (len(submap.positions),):
             raise ValueError(
@@ -129,10 +132,6 @@ def _times_held(
             raise ValueError(f"landmark_index[{i}] is not all of 0 to {num_landmarks - 1}")
         if len(np.unique(index)) < len(index):
             raise ValueError(f"landmark_index[{i}] holds a landmark twice")
-        times[index] += 1
-    if num_landmarks and times.min() == 0:
-        raise ValueError(f"landmark {times.argmin()} is in no submap")
-    return times
 
 
 def minimise(

@@ -73,6 +73,11 @@ def columns_of(origins: np.ndarray, landmarks: np.ndarray) -> Columns:
     return Columns(*result, split + size)
 
 
+def times_held(landmark_index: Sequence[np.ndarray], num_landmarks: int) -> np.ndarray:
+    """Number (L,) of submaps that hold each landmark."""
+    return np.bincount(np.concatenate(landmark_index), minlength=num_landmarks)
+
+
 def make_terms(
     submaps: Sequence[Submap],
     landmark_index: Sequence[np.ndarray],

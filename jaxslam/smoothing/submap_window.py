@@ -32,15 +32,11 @@ from jaxslam.smoothing.submap_terms import (
     linearise,
     make_terms,
     place_others,
+    times_held,
 )
 
 EXPLAINED = 0.999
 """Probability that the cost of a right submap in a right map is less than a window may have."""
-
-
-def times_held(landmark_index: Sequence[np.ndarray], num_landmarks: int) -> np.ndarray:
-    """Number (L,) of submaps that hold each landmark."""
-    return np.bincount(np.concatenate(landmark_index), minlength=num_landmarks)
 
 
 def choose_window(

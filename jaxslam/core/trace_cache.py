@@ -59,7 +59,7 @@ from jax import export
 from jax.sharding import SingleDeviceSharding
 
 from jaxslam.core.cache_limit import UNFINISHED, mark_used
-from jaxslam.core.quick_compilation import quick_options
+from jaxslam.core.quick_compilation import is_short, quick_options
 
 PACKAGE = __name__.split(".")[0]
 HOME = Path(__file__).parents[1]
@@ -236,6 +236,16 @@ def jit(
     """
     names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     return CachedJit(function, tuple(names), compile_quickly)
+
+
+def jit_by_length(
+    function: Callable, *, static_argnames: str | tuple[str, ...] = ()
+) -> Callable[[int], CachedJit]:
+    """`jit` of a function that runs over scans: of their number, as few are compiled quickly."""
+    normally, quickly = (
+        jit(function, static_argnames=static_argnames, compile_quickly=q) for q in (False, True)
+    )
+    return lambda num_scans: quickly if is_short(num_scans) else normally
 
 
 def _within_another(args: tuple, kwargs: dict) -> bool:

@@ -24,7 +24,6 @@ from jaxslam.core import trace_cache
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
-from jaxslam.core.quick_compilation import is_short
 from jaxslam.core.se2 import rotation, wrap_angle
 from jaxslam.core.types import Array
 from jaxslam.evaluation.consistency import CERTAIN_TRACE, nees, pose_error
@@ -83,8 +82,8 @@ def filter_with_statistics(
         ValueError: As of `filter_episodes`.
     """
     params, drives = check_drives(config, params, episodes)
-    run = _FILTER[is_short(drives.odometry.shape[0] * drives.odometry.shape[1])]
-    return run(config.filter, loss, params, drives)
+    num_trials, num_scans = drives.odometry.shape[:2]
+    return _filter_of(num_trials * num_scans)(config.filter, loss, params, drives)
 
 
 def _filter_batch(
@@ -96,12 +95,7 @@ def _filter_batch(
     return map_batches(partial(_filter, config, loss, params), episodes, batch_size=EPISODE_BATCH)
 
 
-_FILTER = {
-    quickly: trace_cache.jit(
-        _filter_batch, static_argnames=("config", "loss"), compile_quickly=quickly
-    )
-    for quickly in (False, True)
-}
+_filter_of = trace_cache.jit_by_length(_filter_batch, static_argnames=("config", "loss"))
 
 
 def _filter(

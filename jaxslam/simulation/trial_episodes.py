@@ -13,7 +13,6 @@ from jaxslam.core import trace_cache
 from jaxslam.core.batching import BatchSize, map_batches, traced_platform
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
-from jaxslam.core.quick_compilation import is_short
 from jaxslam.core.scan import Scan
 from jaxslam.core.types import Array, Key, as_count, as_size, check_type
 from jaxslam.frontend import extract
@@ -112,7 +111,7 @@ def simulate_drives(
     It is compiled for front end and scan matching alone, not for each filter; quickly, where there
     are few scans.
     """
-    return _DRIVES[is_short(keys.shape[0] * num_scans)](
+    return _drives_of(keys.shape[0] * num_scans)(
         keys,
         config,
         robot,
@@ -150,21 +149,10 @@ def drives_and_scans(
     return map_drives(lambda key: one(key, config, robot, world, path), keys)
 
 
-_DRIVES = {
-    quickly: trace_cache.jit(
-        drives_and_scans,
-        static_argnames=(
-            "config",
-            "robot",
-            "num_scans",
-            "noise_by_incidence",
-            "matching",
-            "with_scans",
-        ),
-        compile_quickly=quickly,
-    )
-    for quickly in (False, True)
-}
+_drives_of = trace_cache.jit_by_length(
+    drives_and_scans,
+    static_argnames=("config", "robot", "num_scans", "noise_by_incidence", "matching"),
+)
 
 
 def map_drives(simulate: Callable, items: Any) -> Any:

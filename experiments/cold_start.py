@@ -13,8 +13,11 @@ import subprocess
 import sys
 import tempfile
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from tqdm import tqdm
 
 from experiments import common, import_time, start
 from experiments.common import Numbers
@@ -158,14 +161,12 @@ def measure_builds(builds: tuple[Build, ...], log: Path, folder: Path, repeats: 
         build.name: {command: {kind: [] for kind in KINDS} for command in COMMANDS}
         for build in builds
     }
-    for turn in range(repeats):
-        for command, words in COMMANDS.items():
-            arguments = tuple(str(log) if word == "LOG" else word for word in words)
-            for kind in KINDS:
-                for k, build in enumerate(builds):
-                    own = folder / f"{turn}_{command}_{k}"
-                    done = start_once(build, arguments, own / "cache", own / kind)
-                    found[build.name][command][kind].append(done)
+    starts = list(product(range(repeats), COMMANDS, KINDS, enumerate(builds)))
+    for turn, command, kind, (k, build) in tqdm(starts, desc="starts", leave=False):
+        arguments = tuple(str(log) if word == "LOG" else word for word in COMMANDS[command])
+        own = folder / f"{turn}_{command}_{k}"
+        done = start_once(build, arguments, own / "cache", own / kind)
+        found[build.name][command][kind].append(done)
     return {
         name: {
             command: {kind: _least(each) for kind, each in kinds.items()}

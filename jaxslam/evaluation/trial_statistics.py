@@ -1,5 +1,6 @@
 """Statistics of Monte-Carlo trials: shares, quantiles and differences, each with its interval."""
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,10 +83,18 @@ def quantile(values: Any, probability: float, confidence: float = CONFIDENCE) ->
         raise ValueError(f"probability is {probability}, not between 0 and 1")
     if not len(ordered):
         return Interval(np.nan, np.nan, np.nan)
-    found = stats.quantile_test(ordered, p=probability, q=float(np.median(ordered)))
-    low, high = found.confidence_interval(confidence)
-    low, high = (-np.inf if np.isnan(low) else low), (np.inf if np.isnan(high) else high)
+    first, last = _ranks(len(ordered), probability, confidence)
+    low = -np.inf if np.isnan(first) else ordered[int(first)]
+    high = np.inf if np.isnan(last) else ordered[int(last)]
     return Interval(float(np.quantile(ordered, probability)), float(low), float(high))
+
+
+@lru_cache(maxsize=256)
+def _ranks(count: int, probability: float, confidence: float) -> tuple[float, float]:
+    """Which of the ordered values are the limits of a quantile's interval; NaN: none is."""
+    found = stats.quantile_test(np.arange(count), p=probability, q=(count - 1) / 2)
+    low, high = found.confidence_interval(confidence)
+    return float(low), float(high)
 
 
 def paired_difference(first: Any, second: Any) -> Difference:

@@ -111,11 +111,10 @@ def restrict(submap: Submap, held: np.ndarray) -> Restricted:
     rows = np.concatenate([np.arange(3), point_rows(held)])
     mean = np.concatenate([submap.last_pose, submap.positions[held].reshape(-1)])
     cov = submap.cov[np.ix_(rows, rows)] + STD_FLOOR**2 * np.eye(len(rows))
-    root, failed = lapack.dpotrf(cov, lower=1)
+    _, information, failed = lapack.dposv(cov, np.eye(len(rows)), lower=1)
     if failed:
         raise ValueError("the covariance of a submap is not positive definite")
-    half, _ = lapack.dpotri(root, lower=1)
-    return Restricted(held, mean, np.tril(half) + np.tril(half, -1).T)
+    return Restricted(held, mean, 0.5 * (information + information.T))
 
 
 def residual_of(term: Term, state: State) -> tuple[np.ndarray, np.ndarray]:

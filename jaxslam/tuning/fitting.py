@@ -35,6 +35,14 @@ from jaxslam.tuning.problem import NOT_FINITE, StartError, check_start
 from jaxslam.tuning.problem import Problem as Problem
 from jaxslam.tuning.problem import as_model as as_model
 from jaxslam.tuning.problem import prepare as prepare
+from jaxslam.tuning.sequences import (
+    draw_batch,
+    finite_mean,
+    joined,
+    mean_gradient,
+    take,
+    total_steps,
+)
 from jaxslam.tuning.transforms import Transform
 from jaxslam.tuning.tune_state import TuneResult as TuneResult
 from jaxslam.tuning.tune_state import TuneState as TuneState
@@ -47,6 +55,10 @@ Transforms = tuple[Transform, ...]
 QUICK_STEPS = 20_000
 """Steps of all sequences up to which gradients are compiled in two thirds of the time, and run a
 seventh slower. Values are not: without a gradient the filter would run three times slower."""
+
+TOGETHER_STEPS = 50_000
+"""Steps of all validations up to which they are evaluated with the gradients, by the same program:
+a gradient that nobody asks for then takes less time than compiling values alone."""
 
 
 def _value(model: Model, loss: Loss, transforms: Transforms, theta: Any, sequence: Any) -> Array:
@@ -80,16 +92,10 @@ def _over_devices(
     return DeviceMap(function, size=batch_size, static=3, compile_quickly=quickly)
 
 
-def _is_short(data: Any) -> bool:
-    """Whether compiling takes longer than some tens of evaluations of data [B]."""
-    leaves = jax.tree.leaves(data)
-    return len(leaves[0]) * max(x.shape[1] if x.ndim > 1 else 1 for x in leaves) <= QUICK_STEPS
-
-
 def _evaluate(function: Callable[..., Any], problem: Problem) -> Any:
     """`_value` or `value_and_gradient` of all sequences of a problem."""
     model, loss, transforms, params, data, theta = problem
-    quickly = function is value_and_gradient and _is_short(data)
+    quickly = function is value_and_gradient and total_steps(data) <= QUICK_STEPS
     run = _over_devices(function, model.batch_size, quickly)
     if theta is None:
         return run(model, loss, transforms, unconstrain(params, transforms), data)
@@ -137,31 +143,6 @@ def gradients_of(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """`gradients` of a problem that is checked."""
     value, gradient = _evaluate(value_and_gradient, problem)
     return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
-
-
-def mean_gradient(values: np.ndarray, each: np.ndarray) -> tuple[float, np.ndarray, int]:
-    """Means of losses (B,) and gradients (B, P) over the episodes where both are finite.
-
-    Returns:
-        Mean loss, NaN if no episode is left; mean gradient (P,), 0 if none is left; number of
-        episodes left out.
-    """
-    good = np.isfinite(values) & np.isfinite(each).all(axis=1)
-    if not good.any():
-        return np.nan, np.zeros(each.shape[1]), len(good)
-    return values[good].mean(), each[good].mean(axis=0), int(np.sum(~good))
-
-
-def draw_batch(seed: int, step: int, num_episodes: int, batch_size: int) -> np.ndarray:
-    """Minibatch of a step: sorted numbers (batch_size,) of episodes, drawn without replacement.
-
-    Steps take the next `batch_size` numbers of a sequence of permutations of all episodes, one for
-    each epoch, which depend on the seed alone: a step can be drawn without the steps before it.
-    """
-    position = step * batch_size + np.arange(batch_size)
-    epoch, offset = (position // num_episodes).tolist(), (position % num_episodes).tolist()
-    order = {e: np.random.default_rng([seed, e]).permutation(num_episodes) for e in set(epoch)}
-    return np.sort([order[e][k] for e, k in zip(epoch, offset, strict=True)])
 
 
 def tune(
@@ -262,9 +243,17 @@ def tune(
         params, num_updates=num_updates, frozen=frozen, optimizer=optimizer, transforms=transforms
     )
 
+    together = None
+    if validation is not None and evaluate_every == 1:
+        if (num_updates + 1) * total_steps(validation) <= TOGETHER_STEPS:
+            together = joined(training, validation)
+    last = count + np.arange(0 if together is None else len(jax.tree.leaves(validation)[0]))
+
     def evaluate(theta: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Losses and gradients of the sequences of a step."""
-        batch = training if whole else _take(draw_batch(seed, step, count, size), training)
+        """Losses and gradients of the sequences of a step, and of those validated with them."""
+        batch = training if together is None else together
+        if not whole:
+            batch = take(np.append(draw_batch(seed, step, count, size), last), batch)
         current = unflatten_params(theta, params, transforms)
         return gradients_of(problem._replace(params=current, data=batch, theta=theta))
 
@@ -273,22 +262,27 @@ def tune(
     else:
         check_state(state, start)
         first = state.theta_history[0]
-        each = evaluate(first, 0)
-        own = _with_prior(*mean_gradient(*each)[:2], penalty, weight, first)[0]
-        check_loss_of_state(state, own, _finite_mean(np.abs(each[0])))
+        losses, slopes = evaluate(first, 0)
+        value, gradient, _ = mean_gradient(losses[:size], slopes[:size])
+        own = _with_prior(value, gradient, penalty, weight, first)[0]
+        check_loss_of_state(state, own, finite_mean(np.abs(losses[:size])))
 
     while state.step <= num_updates and not stalled(state, patience):
         step = int(state.step)
-        each = evaluate(state.theta, step)
+        losses, slopes = evaluate(state.theta, step)
+        each = losses[:size], slopes[:size]
         if whole and step == 0:
             check_start(*each, trainable, alone=num_updates > 0 and not penalty.precision.any())
         value, gradient, skipped = mean_gradient(*each)
         value, gradient = _with_prior(value, gradient, penalty, weight, state.theta)
         heldout_loss = np.nan
         if validation is not None and (step % evaluate_every == 0 or step == num_updates):
-            current = unflatten_params(state.theta, params, transforms)
-            now = problem._replace(params=current, data=validation, theta=state.theta)
-            heldout_loss = _finite_mean(values_of(now))
+            if together is None:
+                current = unflatten_params(state.theta, params, transforms)
+                now = problem._replace(params=current, data=validation, theta=state.theta)
+                heldout_loss = finite_mean(values_of(now))
+            else:
+                heldout_loss = finite_mean(losses[size:])
             if step == 0 and not np.isfinite(heldout_loss):
                 raise StartError(f"heldout: the loss of no sequence is finite; {NOT_FINITE}")
         state = record(state, value, heldout_loss, skipped)
@@ -325,13 +319,3 @@ def _optimizer_update(
     optimizer: Any, gradient: Array, state: Any, theta: Array, value: Array
 ) -> tuple[Array, Any]:
     return optimizer.update(gradient, state, theta, value=value)
-
-
-def _take(indices: np.ndarray, data: Any) -> Any:
-    """Some of the sequences, by number."""
-    return jax.tree.map(lambda x: x[indices], data)
-
-
-def _finite_mean(values: np.ndarray) -> float:
-    good = np.isfinite(values)
-    return values[good].mean() if good.any() else np.nan

@@ -45,6 +45,7 @@ from jaxslam.tuning.losses import Loss
 from jaxslam.tuning.model import Model, num_steps
 from jaxslam.tuning.parameters import theta_shape
 from jaxslam.tuning.priors import flatten_prior
+from jaxslam.tuning.sequences import mean_gradient
 from jaxslam.tuning.transforms import REAL, of_leaves
 
 DIFFERENCE_STEP = 0.1  # step of a logarithm for central differences of the gradient
@@ -177,7 +178,7 @@ def second_derivatives(
         beside = theta + offset * (np.arange(len(theta)) == index)
         params = parameters.unflatten_params(beside, problem.params, transforms)
         each = fitting.gradients_of(problem._replace(params=params, theta=beside))
-        return fitting.mean_gradient(*each)[1][indices]
+        return mean_gradient(*each)[1][indices]
 
     rows = [
         (gradient_beside(i, DIFFERENCE_STEP) - gradient_beside(i, -DIFFERENCE_STEP))

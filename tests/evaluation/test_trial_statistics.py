@@ -35,6 +35,9 @@ def test_the_interval_of_a_quantile_covers_it(probability):
     covered = np.mean([one.low <= true <= one.high for one in found])
     assert covered > 0.95 - 4.5 * np.sqrt(0.05 * 0.95 / 1000)
     assert np.mean([one.low > -np.inf and one.high < np.inf for one in found]) > 0.9
+    values = rng.exponential(size=80)
+    reference = stats.quantile_test(values, p=probability).confidence_interval(0.9)
+    assert quantile(values, probability, 0.9)[1:] == tuple(reference)
     assert quantile([1.0, 2.0, np.nan], 0.9).high == np.inf
     assert np.isnan(quantile([np.nan], 0.5).value)
 

@@ -1,5 +1,7 @@
 """Noise tuned on simulated episodes whose true noise parameters are known."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import optax
 import pytest
 
 from experiments import exact_model
-from jaxslam.tuning import fitting, optimizers, parameters, standard_errors
+from jaxslam.tuning import fitting, optimizers, parameters, sequences, standard_errors
 from jaxslam.tuning.losses import WeightedLoss, check_loss, innovation_nll, pose_mse, pose_nll
 from jaxslam.tuning.tune_state import TuneState
 
@@ -101,15 +103,31 @@ def test_an_episode_without_a_finite_loss_is_left_out_and_counted(episodes):
     rest = select(episodes, [0, 1, 1, 3, 4, 5, 6, 7])
     values, each = fitting.gradients(CONFIG, TRUTH, broken, LOSS)
     assert np.isfinite(values).tolist() == [i != 2 for i in range(B)]
-    mean, slope, bad = fitting.mean_gradient(values, each)
+    mean, slope, bad = sequences.mean_gradient(values, each)
     right = fitting.gradients(CONFIG, TRUTH, rest, LOSS)
     keep = np.arange(B) != 2
     np.testing.assert_allclose(mean, right[0][keep].mean())
     np.testing.assert_allclose(slope, right[1][keep].mean(axis=0))
     assert bad == 1
     assert tuned(broken, num_updates=1).skipped.tolist() == [1, 1]
-    nothing = fitting.mean_gradient(np.full(2, np.nan), np.zeros((2, 3)))
+    nothing = sequences.mean_gradient(np.full(2, np.nan), np.zeros((2, 3)))
     assert np.isnan(nothing[0]) and not nothing[1].any() and nothing[2] == 2
+
+
+@pytest.mark.parametrize("changes", [{}, {"batch_size": 3, "optimizer": optax.adam(0.1)}])
+def test_validation_beside_the_gradients_is_that_by_itself(episodes, monkeypatch, changes):
+    """The same losses, whichever program evaluates the held-out sequences; one need not be good."""
+    heldout = select(episodes, [1, 5, 6])._replace(odometry=episodes.odometry[[1, 5, 6]].copy())
+    heldout.odometry[2, 4] = np.nan
+    given = {"heldout": heldout, "num_updates": 2} | changes
+    beside = tuned(episodes, **given)
+    kept = []
+    tuned(episodes, callback=kept.append, **given)
+    jax.tree.map(np.testing.assert_array_equal, beside, tuned(episodes, state=kept[0], **given))
+    monkeypatch.setattr(fitting, "TOGETHER_STEPS", 0)
+    alone = tuned(episodes, **given)
+    assert np.isfinite(beside.heldout).all() and not np.isclose(*beside.heldout[:2])
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12), beside, alone)
 
 
 @pytest.mark.parametrize("stop", [1, 4, 6])
@@ -125,11 +143,11 @@ def test_a_resumed_tuning_ends_as_an_uninterrupted_one(episodes, stop):
 
 def test_minibatches_take_all_episodes_in_turn():
     for seed in range(3):
-        seen = np.concatenate([fitting.draw_batch(seed, step, 12, 5) for step in range(12)])
+        seen = np.concatenate([sequences.draw_batch(seed, step, 12, 5) for step in range(12)])
         assert np.bincount(seen, minlength=12).tolist() == [5] * 12
-        orders = [fitting.draw_batch(seed, step, 12, 12) for step in range(2)]
+        orders = [sequences.draw_batch(seed, step, 12, 12) for step in range(2)]
         assert all(order.tolist() == list(range(12)) for order in orders)
-    assert not np.array_equal(fitting.draw_batch(0, 0, 12, 5), fitting.draw_batch(1, 0, 12, 5))
+    assert not np.array_equal(sequences.draw_batch(0, 0, 12, 5), sequences.draw_batch(1, 0, 12, 5))
 
 
 def state_of(heldout, loss):

@@ -65,6 +65,10 @@ SAME_PROGRAMS = (
         for x in ("sessions", "pieces", "reclosing", "self_calibration")
     ],
     [f"tests/cli/test_{x}.py" for x in ("run_logs", "calibrated_logs")],
+    [
+        f"tests/{x}.py"
+        for x in ("simulation/test_trials", "study/test_runner", "experiments/test_monte_carlo")
+    ],
 )
 
 

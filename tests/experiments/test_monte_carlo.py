@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from functools import cache
 from io import StringIO
 from time import monotonic
 
@@ -13,45 +12,15 @@ import numpy as np
 import pytest
 
 from experiments import filter_benchmark, monte_carlo, scaling
-from jaxslam.core.scan import Lidar
-from jaxslam.core.types import CORNER, WALL
-from jaxslam.filtering.config import FilterConfig
-from jaxslam.filtering.noise import NoiseParams
-from jaxslam.frontend.config import FrontendConfig
-from jaxslam.frontend.grid import GridSpec
 from jaxslam.io.errors import InputError
 from jaxslam.io.output import plain
-from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.episodes import TrialResult
-from jaxslam.simulation import worlds
-from jaxslam.simulation.path_following import densify
-from jaxslam.simulation.robot import Robot
 from jaxslam.study import kept_trials, processes
-from jaxslam.study.runner import Variant
+from tests.short_trials import variant
 
-CONFIG = Config.for_lidar(
-    Lidar(num_beams=91, angle_increment=np.pi / 90),
-    frontend=FrontendConfig(grid=GridSpec(x_max=4.0, y_half=3.0)),
-    filter=FilterConfig(max_landmarks=16, max_updates=4, landmark_kinds=(CORNER, WALL)),
-)
 SEED = 5
 NUM_TRIALS = 10
 TIMED = {"seconds", "seconds_per_scan", "peak_mb", "processes", "devices"}
-
-
-@cache
-def case():
-    """What is driven; not made at import, where processes that start may not use JAX yet."""
-    return Variant(
-        "room",
-        {},
-        CONFIG,
-        NoiseParams.for_simulated_robot(),
-        Robot(),
-        worlds.named("fig07"),
-        densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)])),
-        4,
-    )
 
 
 def untimed(numbers):
@@ -63,7 +32,7 @@ def untimed(numbers):
 def done(tmp_path_factory):
     """The numbers of one process, and the folder where it has kept its runs."""
     folder = tmp_path_factory.mktemp("one") / "runs"
-    return monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO()), folder
+    return monte_carlo.work(variant(), SEED, NUM_TRIALS, folder, StringIO()), folder
 
 
 @pytest.mark.timeout(300)
@@ -72,7 +41,9 @@ def test_two_processes_give_the_same_as_one_bit_for_bit(done, tmp_path, monkeypa
     monkeypatch.setenv("JAX_ENABLE_X64", "1")  # as in this one, which has two devices
     flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")
     monkeypatch.setenv("XLA_FLAGS", flags)
-    numbers = monte_carlo.compute(case(), SEED, NUM_TRIALS, tmp_path / "runs", processes.local(2))
+    numbers = monte_carlo.compute(
+        variant(), SEED, NUM_TRIALS, tmp_path / "runs", processes.local(2)
+    )
     assert numbers["processes"] == numbers["devices"] == 2
     assert untimed(numbers) == untimed(done[0])
     (one,), (two,) = ([*folder.glob("*.npz")] for folder in (done[1], tmp_path / "runs"))
@@ -148,12 +119,12 @@ def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_pat
 
     monkeypatch.setattr(kept_trials, "_keep", stopping)
     with pytest.raises(Stop):
-        monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO())
+        monte_carlo.work(variant(), SEED, NUM_TRIALS, folder, StringIO())
     monkeypatch.setattr(kept_trials, "_keep", real)
     (file,) = folder.iterdir()
     before = file.stat().st_mtime_ns
     (folder / ".123.tmp").write_bytes(b"half of")
-    numbers = monte_carlo.work(case(), SEED, NUM_TRIALS, folder, StringIO())
+    numbers = monte_carlo.work(variant(), SEED, NUM_TRIALS, folder, StringIO())
     assert untimed(numbers) == untimed(done[0]) and file.stat().st_mtime_ns == before
     assert [f.name for f in sorted(folder.glob("*.npz"))] == ["0000000.npz", "0000008.npz"]
 
@@ -161,7 +132,7 @@ def test_an_experiment_that_was_stopped_resumes_and_gives_the_same(done, tmp_pat
 @pytest.mark.slow
 def test_trials_of_another_seed_are_not_mixed_in(done):
     with pytest.raises(InputError, match="has trials of another variant, seed"):
-        monte_carlo.work(case(), SEED + 1, NUM_TRIALS, done[1])
+        monte_carlo.work(variant(), SEED + 1, NUM_TRIALS, done[1])
 
 
 def kept(folder):
@@ -205,7 +176,7 @@ def test_trials_that_are_not_finite_are_masked_and_listed(done):
 @pytest.mark.slow
 def test_one_trial_is_replayed_alone(done):
     worst = done[0]["worst"][0]
-    alone = monte_carlo.replay(case(), SEED, worst["run"])
+    alone = monte_carlo.replay(variant(), SEED, worst["run"])
     assert alone["position_rmse_m"] == pytest.approx(worst["position_rmse_m"], rel=1e-12)
     np.testing.assert_array_equal(alone["worst"][0]["estimate"], worst["estimate"])
 

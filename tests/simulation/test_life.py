@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from jaxslam.core.scan import Lidar
-from jaxslam.core.se2_np import increments
+from jaxslam.core.se2_np import dead_reckoning, increments
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.pipeline.config import Config
+from jaxslam.pipeline.episodes import concatenate_results
 from jaxslam.simulation import (
     RangeErrors,
     Robot,
@@ -24,6 +25,7 @@ from jaxslam.simulation import (
     named,
     run_trials,
     simulate_episodes,
+    trial_episodes,
 )
 
 LIDAR = Lidar(num_beams=41, angle_min=-1.0, angle_increment=0.05, range_max=20.0, range_std=0.0)
@@ -146,9 +148,9 @@ def lifeless(key):
 
 
 def test_a_trial_with_life_is_reproducible_and_has_the_drive_of_one_without():
+    """On one device and in batches of four; without life fewer landmarks are missed."""
     config = Config.for_lidar(Lidar(num_beams=61, angle_min=-1.5, angle_increment=0.05))
-    world, key = named("office"), jax.random.key(0)
-    given = {"num_trials": 5, "num_scans": 6}
+    world, key, params = named("office"), jax.random.key(0), NoiseParams.for_simulated_robot()
     lively = life_in(
         world,
         DRIVE,
@@ -156,21 +158,36 @@ def test_a_trial_with_life_is_reproducible_and_has_the_drive_of_one_without():
         ranges=RangeErrors(missing=0.2, glass=0.1, spot=0.01),
         wheels=WheelFaults(dropped=0.3),
     )
-    run = partial(simulate_episodes, key, config, Robot(), world, DRIVE, **given)
-    first, empty = run(life=lively), life_in(world, DRIVE, max_people=len(lively.movers.people))
-    for found, of_drive in zip((first.truth, first.odometry), lifeless(key), strict=True):
-        np.testing.assert_allclose(found, of_drive, atol=1e-12)
-    assert np.sum(first.features.valid) < np.sum(run(life=empty).features.valid)
-    params = NoiseParams.for_simulated_robot()
-    both = [
-        [x for part in run_trials(key, config, params, Robot(), world, DRIVE, num_trials=n,
-                                  num_scans=6, life=lively) for x in part.estimate]
-        for n in (5, 2)
-    ]  # fmt: skip
-    np.testing.assert_array_equal(both[0][:2], both[1])
+    empty = life_in(world, DRIVE, max_people=len(lively.movers.people))
+
+    def run(life, num_trials):
+        given = {"num_trials": num_trials, "num_scans": 6, "devices": jax.devices()[:1]}
+        parts = run_trials(key, config, params, Robot(), world, DRIVE, life=life, **given)
+        return concatenate_results(list(parts))
+
+    first, others = run(lively, 5), run(empty, 5)
+    truth, odometry = jax.tree.map(np.asarray, lifeless(key))
+    tracks = [dead_reckoning(*drive_) for drive_ in zip(truth[:, 0], odometry, strict=True)]
+    np.testing.assert_allclose(first.truth, truth, atol=1e-12)
+    np.testing.assert_allclose(first.dead_reckoning, tracks, atol=1e-12)
+    assert np.sum(first.num_updates) < np.sum(others.num_updates)
+    fewer = jax.tree.map(lambda x: x[:4], first)
+    jax.tree.map(np.testing.assert_array_equal, run(lively, 4), fewer)
+
+
+def test_episodes_are_simulated_with_the_life_that_is_given(monkeypatch):
+    world, config = named("office"), Config.for_lidar(Lidar(num_beams=61))
+    lively = life_in(world, DRIVE, traffic=Traffic(people=3.0))
+    run = partial(simulate_episodes, jax.random.key(0), config, Robot(), world, DRIVE, num_trials=2)
+    given = []
+    monkeypatch.setattr(
+        trial_episodes, "simulate_drives", lambda *_, life, **__: given.append(life)
+    )
+    run(num_scans=6, life=lively)
+    assert given == [lively]
     other = lively._replace(materials=lively.materials[1:])
     with pytest.raises(ValueError, match="life.materials has 150 walls and world.walls 151; make"):
-        run(life=other)
+        run(num_scans=6, life=other)
 
 
 @pytest.mark.parametrize(

@@ -4,39 +4,21 @@ import numpy as np
 import pytest
 
 from jaxslam.core import se2
-from jaxslam.core.scan import Lidar
 from jaxslam.core.se2 import relative, wrap_angle
 from jaxslam.evaluation.summary import evaluate
 from jaxslam.filtering.config import FilterConfig
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.frontend.config import FrontendConfig
-from jaxslam.frontend.grid import GridSpec
 from jaxslam.mapping.config import MappingSpec
 from jaxslam.pipeline import episodes
-from jaxslam.pipeline.config import Config
 from jaxslam.simulation import path_following, robot, trial_episodes, trials, worlds
 from jaxslam.simulation.drives import drive, num_scans_of_drive
 from jaxslam.simulation.robot import Robot
 from jaxslam.simulation.trial_episodes import simulate_episodes
 from jaxslam.simulation.trial_map import slam_result
 from jaxslam.simulation.worlds import World
+from tests.short_trials import CONFIG, PATH, ROBOT, STEPS
 
-STEPS = 6
-CONFIG = Config.for_lidar(
-    Lidar(num_beams=181, angle_increment=np.pi / 180),
-    frontend=FrontendConfig(
-        grid=GridSpec(x_max=5.0, y_half=4.0),
-    ),
-    filter=FilterConfig(
-        max_landmarks=16,
-        max_updates=4,
-    ),
-)
-ROBOT = Robot()
 KEY = jax.random.key(5)
-PATH = path_following.densify(np.array([(0.7, 0.8), (2.0, 1.0), (2.2, 2.3), (1.6, 3.6)]))
-
-
 SETTING = (
     CONFIG,
     NoiseParams.for_simulated_robot(*ROBOT[:2]),

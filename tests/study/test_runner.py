@@ -6,30 +6,18 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam import Config, NoiseParams
-from jaxslam.core.scan import Lidar
+from jaxslam import NoiseParams
 from jaxslam.io.errors import InputError
 from jaxslam.pipeline.episodes import EPISODE_BATCH
-from jaxslam.simulation import Robot, World, densify, life_in, named
+from jaxslam.simulation import Robot, World, life_in
 from jaxslam.study import kept_trials, runner
-from jaxslam.study.runner import Variant, run
-
-LIDAR = Lidar(num_beams=61, angle_min=-1.5, angle_increment=0.05)
-CONFIG = Config.for_lidar(LIDAR)
-CONFIG = CONFIG._replace(filter=CONFIG.filter._replace(max_landmarks=16))
-PATH = densify([(1.0, 0.9), (2.5, 0.9)])
+from jaxslam.study.runner import run
+from tests import short_trials
+from tests.short_trials import CONFIG, PATH, STEPS
 
 
 def variant(name="a", **changes):
-    given = {
-        "config": CONFIG,
-        "params": NoiseParams.for_simulated_robot(),
-        "robot": Robot(),
-        "world": named("office"),
-        "path": PATH,
-        "num_scans": 4,
-    }
-    return Variant(name, {}, **(given | changes))
+    return short_trials.variant()._replace(name=name, **changes)
 
 
 @pytest.fixture
@@ -58,7 +46,7 @@ def assert_same(first, second):
 def test_a_study_that_is_stopped_ends_with_the_same_outcomes(tmp_path, small_files):
     both = [variant(), variant("b", params=NoiseParams.for_simulated_robot(0.4, 0.01))]
     whole = run(both, num_trials=10, seed=3)
-    assert len(whole[0].finite) == 10 and whole[0].error.shape == (10, 4)
+    assert len(whole[0].finite) == 10 and whole[0].error.shape == (10, STEPS)
     with pytest.raises(Stop):
         run(both, num_trials=10, seed=3, folder=tmp_path, callback=stop_after(1, 4))
     seen = []
@@ -101,12 +89,12 @@ def test_trials_of_something_else_are_refused(tmp_path, small_files):
 
 
 def test_fingerprints_differ_for_all_that_matters():
-    living = life_in(named("office"), PATH, max_people=2)
+    living = life_in(variant().world, PATH, max_people=2)
     more = living._replace(traffic=living.traffic._replace(people=np.float32(1.0)))
-    walls = named("office").walls
+    walls = np.asarray(variant().world.walls)
     cases = [
         variant(),
-        variant(num_scans=5),
+        variant(num_scans=STEPS + 1),
         variant(config=CONFIG._replace(filter=CONFIG.filter._replace(max_landmarks=8))),
         variant(params=NoiseParams.for_simulated_robot(0.4, 0.02)),
         variant(world=World(walls + 1e-9)),

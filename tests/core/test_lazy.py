@@ -7,7 +7,7 @@ import pytest
 import jaxslam
 import jaxslam.mapping
 
-LAZY = ("core", "evaluation", "filtering", "io", "mapping", "matching", "pipeline")
+LAZY = ("core", "evaluation", "filtering", "io", "mapping", "matching", "pipeline", "study")
 
 
 @pytest.mark.parametrize("package", LAZY)

@@ -95,6 +95,13 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def frozen() -> Iterator[None]:
+    """What a module leaves behind, above all traces of JAX, is not looked through again."""
+    yield
+    gc.freeze()
+
+
 @pytest.fixture
 def single_precision() -> Iterator[None]:
     """Run a test in float32, as users do; the others run in float64."""

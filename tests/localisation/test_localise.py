@@ -197,8 +197,8 @@ def test_padding_leaves_the_state(drive, place_map):
 
 def test_a_scan_without_any_return_is_no_evidence(drive, place_map):
     state = run(place_map, *beside(drive, 25, seed=5))[0]
-    nothing = Scan(jnp.full(LIDAR.num_beams, LIDAR.range_max), jnp.zeros(LIDAR.num_beams, bool))
-    after, info = one_step(SPEC, LIDAR, place_map, state, nothing, jnp.array([0.2, 0.0, 0.0]))
+    nothing = Scan(np.full(LIDAR.num_beams, LIDAR.range_max), np.zeros(LIDAR.num_beams, bool))
+    after, info = one_step(SPEC, LIDAR, place_map, state, nothing, np.array([0.2, 0.0, 0.0]))
     assert not info.searched and not after.lost
     np.testing.assert_array_equal(after.hypotheses.log_weight, state.hypotheses.log_weight)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxslam.cli.world_options import Building
 from jaxslam.core import polylines
+from jaxslam.core.batching import on_device
 from jaxslam.core.scan import Lidar
 from jaxslam.core.se2_np import compose
 from jaxslam.io import life_file
@@ -115,7 +116,7 @@ def leaving(lidar: Lidar, world: World, robot: Robot, path: Any) -> Leaving:
     poses = np.column_stack([even, np.arctan2(along[:, 1], along[:, 0])])
     for mount in (robot.nominal_mount, robot.mount):
         poses = compose(poses, np.array(mount, float))
-    given = jnp.asarray(poses, float)
+    given = on_device(poses)
     found = ray_casting.share_leaving(lidar, world._replace(wall_index=None), given)
     if found.beyond_range > NOTHING_SEEN:
         width, height = np.ptp(np.reshape(world.walls, (-1, 2)), axis=0)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 import tyro
 from tqdm import tqdm
@@ -49,6 +50,8 @@ from jaxslam.pipeline.log_input import LogInput, OdometrySource
 from jaxslam.pipeline.online import ChunkResult, SlamState
 from jaxslam.pipeline.results import SlamResult
 from jaxslam.viz.rerun_view import RerunView
+
+_confirmed = jax.jit(confirmed, static_argnums=0)
 
 INCONSISTENT = 3  # exit code of `--strict`
 
@@ -326,7 +329,7 @@ def _run_slam(
             num_done = int(np.asarray(chunk.keyframes)[-1]) + 1
             done = num_done == num_scans
             bar.set_description("smoothing" if done and smooth else "mapping", refresh=False)
-            num_landmarks = int(np.sum(confirmed(given.config.filter, state.belief)))
+            num_landmarks = int(np.asarray(_confirmed(given.config.filter, state.belief)).sum())
             bar.set_postfix_str(f"{num_landmarks} landmarks", refresh=False)
             bar.update(num_done - bar.n)
             if viewer is not None:

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli import map_files, report, room_results
@@ -15,6 +14,7 @@ from jaxslam.cli.run_evaluation import (
     errors_of,
     not_used,
 )
+from jaxslam.core.batching import on_device
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.regions import Regions
 from jaxslam.core.se2_np import compose, relative, trajectories_as_one
@@ -138,7 +138,7 @@ def write(
     arc_ids = report.write_results(out_dir, numbers, graph, old, next_id, rooms, planner)
     map_files.draw_map(out_dir / "map.png", occupancy, graph, rooms)
     measurements = Measurement(
-        jnp.asarray(result.odometry, float), result.features, scan_match=result.scan_matches
+        on_device(result.odometry), result.features, scan_match=result.scan_matches
     )
     config = config._replace(  # the map has grown to its size, which the files are made for
         filter=config.filter._replace(max_landmarks=result.belief.num_seen.size)

@@ -121,7 +121,8 @@ def simulate(
         robot_radius=simulated.radius,
     )
     walls, points = building.world, building.path
-    (width, height), count = np.ptp(np.reshape(walls.walls, (-1, 2)), axis=0), len(walls.walls)
+    corners, count = np.asarray(walls.walls).reshape(-1, 2), len(walls.walls)
+    width, height = np.ptp(corners, axis=0)
     print(f"{world}: {count} walls, {width:.1f} m x {height:.1f} m", flush=True)
     for note in building.notes:
         print(f"note: {note}", flush=True)

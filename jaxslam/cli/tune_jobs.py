@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli import calibrated_logs
 from jaxslam.cli.log_options import ScannerOptions, read_params, require_odometry
 from jaxslam.cli.options import name_errors
 from jaxslam.core import time_series
+from jaxslam.core.batching import on_device
 from jaxslam.core.episode import Episode
 from jaxslam.evaluation.log_errors import Trajectory
 from jaxslam.filtering.noise import NoiseParams
@@ -95,8 +95,8 @@ def simulated_task(
 ) -> TuneTask:
     """Check the options of a tuning on simulated trials."""
     with name_errors("--world"):
-        walls = World(jnp.asarray(named_worlds.named(world).walls, float))
-        path = jnp.asarray(named_worlds.named_path(world), float)
+        walls = World(on_device(named_worlds.named(world).walls))
+        path = on_device(named_worlds.named_path(world))
     params = read_params(noise, NoiseParams.for_laser_log())
 
     def load() -> TuneJob:

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxslam.cli.options import name_errors
 from jaxslam.core import polylines
+from jaxslam.core.batching import on_device
 from jaxslam.core.maps import OccupancyMap
 from jaxslam.core.se2_np import inverse_transform
 from jaxslam.core.types import Array
@@ -110,7 +111,7 @@ def read_building(
             found = named_worlds.found_drive(
                 building.world, drive, building.occupancy, robot_radius=robot_radius
             )
-        walls = World(jnp.asarray(building.world.walls, float))
+        walls = World(on_device(building.world.walls))
         notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
         driven = jnp.asarray(found.path, float)
         return Building(walls, driven, tuple(notes), world, building.occupancy)
@@ -120,8 +121,8 @@ def read_building(
     elif robot_radius:
         with name_errors(f"the drive of {world}"):
             _check_room(points, building.world, robot_radius)
-    walls = World(jnp.asarray(building.world.walls, float))
-    driven = jnp.asarray(path_following.densify(points), float)
+    walls = World(on_device(building.world.walls))
+    driven = on_device(path_following.densify(points))
     return Building(walls, driven, tuple(notes), world, building.occupancy)
 
 

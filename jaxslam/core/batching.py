@@ -209,9 +209,13 @@ def pad_to(items: Any, *, to: int) -> Any:
 
 
 def on_device(items: Any) -> Any:
-    """NumPy arrays as JAX arrays, real numbers in JAX's default precision."""
+    """NumPy arrays and numbers as JAX arrays, real numbers in JAX's default precision.
 
-    def put(x: np.ndarray) -> Array:
-        return jnp.asarray(x, float if x.dtype.kind == "f" else None)
+    Nothing is compiled; `jnp.asarray` compiles a program for each shape and type.
+    """
+
+    def put(x: Any) -> Array:
+        array = np.asarray(x)
+        return jax.device_put(array.astype(float) if array.dtype.kind == "f" else array)
 
     return jax.tree.map(put, items)

@@ -55,6 +55,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from jax import export
 from jax.sharding import SingleDeviceSharding
 
@@ -251,7 +252,7 @@ def jit_by_length(
 def _within_another(args: tuple, kwargs: dict) -> bool:
     """Whether a function with such arguments is called while another is being traced."""
     given = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((args, kwargs)))
-    return given or isinstance(jax.lax.full((), 0), jax.core.Tracer)
+    return given or isinstance(jax.device_put(np.int32(0)), jax.core.Tracer)
 
 
 def _common_device(leaves: list[Any]) -> jax.Device | None:

@@ -26,7 +26,7 @@ from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.se2 import rotation, wrap_angle
 from jaxslam.core.types import Array
-from jaxslam.evaluation.consistency import CERTAIN_TRACE, nees, pose_error
+from jaxslam.evaluation.consistency import CERTAIN_TRACE, pose_nees
 from jaxslam.evaluation.filter_consistency import ConsistencyReport, consistency_of_nis
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.belief import Belief
@@ -186,8 +186,7 @@ def slam_consistency(
     if not used.any():
         return None
     has = used[..., None] & statistics.corrected & np.isfinite(statistics.correction)
-    error = pose_error(jnp.asarray(results.estimate), jnp.asarray(results.truth))
-    squares = np.asarray(nees(error, jnp.asarray(results.cov)))
+    squares = np.asarray(pose_nees(results.estimate, results.truth, results.cov))
     certain = np.trace(results.cov, axis1=-2, axis2=-1) < CERTAIN_TRACE
     known = good[:, None] & results.truth_mask & ~certain & np.isfinite(squares)
     return consistency_of_nis(

@@ -32,7 +32,7 @@ def evaluate(results: TrialResult) -> Metrics:
     arrays = _checked(results)
     good = arrays.finite & np.all(np.isfinite(arrays.estimate), axis=(1, 2))
     poses = arrays.estimate, arrays.dead_reckoning, arrays.truth, arrays.cov
-    error, drift, values = (np.asarray(x) for x in _errors(*map(jnp.asarray, poses)))
+    error, drift, values = (np.asarray(x) for x in _errors(*poses))
     diverged = np.flatnonzero(~good | _far(error, arrays.truth_mask))
     # Until the first motion the pose is certain, and NEES is not defined.
     certain = np.trace(arrays.cov, axis1=-2, axis2=-1) < CERTAIN_TRACE

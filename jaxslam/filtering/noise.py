@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxslam.core.batching import on_device
 from jaxslam.core.features import Features
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.types import WALL, Array
@@ -114,7 +116,10 @@ class NoiseParams(NamedTuple):
 
 def _arrays(*numbers: Any) -> Iterator[Any]:
     """Numbers as arrays of JAX's default float type."""
-    return (jnp.asarray(x, float) for x in numbers)
+    return (
+        jnp.asarray(x, float) if isinstance(x, jax.Array) else on_device(np.asarray(x, float))
+        for x in numbers
+    )
 
 
 def measurement_cov(

@@ -19,11 +19,11 @@ On the host, when the map is asked for (`build_map`):
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.core import polylines, trace_cache
+from jaxslam.core.batching import on_device
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.types import CORNER, JUNCTION, as_float64
 from jaxslam.filtering.belief import Belief
@@ -83,7 +83,7 @@ def build_map(
             raise ValueError(f"{name} is {limit}, not a number >= 0")
     slots, node_of = _graph_nodes(belief, confirm_count, min_separation, max_log_clearance_ratio)
     ids, kind = np.asarray(belief.id)[slots], np.asarray(belief.kind)[slots]
-    xy = np.asarray(belief.landmark_positions, float)[slots]
+    xy = np.asarray(belief.mean, float)[3:].reshape(-1, 2)[slots]
     clearance = np.where(kind == JUNCTION, np.asarray(belief.descriptor, float)[slots], 0.0)
     radius = np.where(kind == JUNCTION, PASS_CLEARANCE * clearance, 0.0)
     observed = [
@@ -128,7 +128,7 @@ def _graph_nodes(
         0..N-1 of the node that each junction id stands for, duplicates included.
     """
     seen, kind, ids = (np.asarray(field) for field in (belief.num_seen, belief.kind, belief.id))
-    xy = np.asarray(belief.landmark_positions, float)
+    xy = np.asarray(belief.mean, float)[3:].reshape(-1, 2)
     log_clearance = np.log(np.maximum(belief.descriptor, 1e-3))
     junctions = np.flatnonzero((seen > 0) & (kind == JUNCTION))
     confirmed = seen[junctions] >= confirm_count
@@ -180,7 +180,7 @@ def _arcs_between(arcs: ArcTable, node_of: dict[int, int], xy: np.ndarray) -> li
     last[slots] += np.where(frontier, first[slots] - stored[slots, 0], 0.0)
     last[slots] = np.where(frontier, last[slots], xy[pairs[:, 1]])
     # All slots, used or not, so that the shape never changes and one program is compiled.
-    transported = _attach(*(jnp.asarray(points, float) for points in (stored, first, last)))
+    transported = _attach(*on_device((stored, first, last)))
     lines = np.asarray(transported, float)[slots]
     scale = polylines.length(lines) / np.maximum(polylines.length(stored[slots]), 1e-6)
     found = [

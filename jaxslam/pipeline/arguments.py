@@ -11,12 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.arguments import as_bool
+from jaxslam.core.batching import on_device
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.types import as_float64, check_array, check_type
 from jaxslam.filtering.inputs import check_params
 from jaxslam.filtering.noise import NoiseParams
 from jaxslam.frontend.lidar import to_scan
 from jaxslam.pipeline.config import Config
+
+scans_of_log = jax.jit(to_scan, static_argnums=0)
+"""`to_scan` as one program, not one for each of its operations."""
 
 ZERO_ROW = 1e-6  # [m], [rad] what counts as zero in the first row of odometry
 POSE_RANGE = 2.0  # [m] increments are shorter than this; poses of a drive are further off
@@ -37,7 +41,7 @@ def as_start(start: Any) -> jax.Array:
     pose = np.zeros(3) if start is None else as_float64("start", start, (3,))
     if not np.isfinite(pose).all():
         raise ValueError(f"start is {pose.tolist()}, which is not finite")
-    return jnp.asarray(pose, float)
+    return on_device(pose)
 
 
 def as_odometry(odometry: Any, *, name: str = "odometry") -> np.ndarray:
@@ -121,7 +125,7 @@ def as_scans(lidar: Lidar, ranges: Any, num_scans: int) -> Scan:
         check_array("ranges.hit", ranges.hit, array.shape, jnp.bool_)
         scans = Scan._make((array.astype(jnp.zeros(()).dtype), np.asarray(ranges.hit)))
     else:
-        scans = jax.tree.map(np.asarray, to_scan(lidar, jnp.asarray(array, float)))
+        scans = jax.tree.map(np.asarray, scans_of_log(lidar, on_device(array)))
     if not scans.hit.any():
         raise ValueError(
             f"{name}: no beam of {num_scans} scans hit anything between 0 and {lidar.range_max} m, "

@@ -134,7 +134,7 @@ def chunk_at(first: int, odometry: np.ndarray, scans: Scan) -> tuple[np.ndarray,
 def padded_chunk(odometry: np.ndarray, scans: Scan) -> tuple[Scan, Array, Array]:
     """Scans and odometry of a chunk, padded, in JAX's precision, and its length () int32."""
     padded_scans, increments = on_device(pad_to((scans, odometry), to=CHUNK))
-    return padded_scans, increments, jnp.int32(len(odometry))
+    return padded_scans, increments, on_device(np.int32(len(odometry)))
 
 
 def match_chunk(
@@ -174,7 +174,7 @@ def extract_matched(
     """
     padded_scans, increments, count = padded_chunk(odometry, scans)
     features, local_arcs = extract.extract_local_graphs(config.frontend, padded_scans)
-    matches = jax.tree.map(jnp.asarray, pad_to(matches, to=CHUNK))
+    matches = on_device(pad_to(matches, to=CHUNK))
     measurements = Measurement(increments, features, scan_match=matches)
     return Chunk(count, padded_scans, measurements, local_arcs, submap)
 

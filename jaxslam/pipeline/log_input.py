@@ -4,14 +4,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.batching import on_device
 from jaxslam.core.logs import LaserLog
 from jaxslam.core.scan import Scan
 from jaxslam.core.se2_np import increments, relative
 from jaxslam.filtering.noise import NoiseParams
-from jaxslam.frontend import lidar
 from jaxslam.mapping.saved_map import SavedMap
 from jaxslam.pipeline import arguments, breaks, offline
 from jaxslam.pipeline.chunks import ChunkResult
@@ -21,9 +20,6 @@ from jaxslam.pipeline.results import SlamResult
 
 OdometrySource = Literal["scan", "scans-only", "wheels"]
 """Scan matching fused with wheel odometry, scan matching alone, or wheel odometry alone."""
-
-# One program, not one for each of its operations.
-_to_scan = jax.jit(lidar.to_scan, static_argnums=0)
 
 
 class LogInput(NamedTuple):
@@ -79,7 +75,7 @@ def from_laser_log(laser_log: LaserLog, source: OdometrySource = "scan") -> LogI
     config.check()
     odom_poses = relative(laser_log.odom_poses[0], laser_log.odom_poses)
     odometry = arguments.as_log_odometry(increments(odom_poses))
-    scans = _to_scan(config.frontend.lidar, jnp.asarray(laser_log.ranges, float))
+    scans = arguments.scans_of_log(config.frontend.lidar, on_device(laser_log.ranges))
     arguments.as_scans(config.frontend.lidar, laser_log.ranges, len(odometry))
     guessed = laser_log.odometry_guessed
     return LogInput(

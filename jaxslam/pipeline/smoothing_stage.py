@@ -1,10 +1,9 @@
 """Batch smoothing of a whole drive: all poses and landmarks from all measurements, with loops."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import trace_cache
-from jaxslam.core.batching import pad_to
+from jaxslam.core.batching import on_device, pad_to
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.scan import Scan
 from jaxslam.core.types import AnyArray, Array
@@ -96,7 +95,7 @@ def smooth_result(
     poses, positions = map(np.asarray, (smoothed.poses[:steps], smoothed.landmark_positions))
     positions = _positions_of(belief, np.asarray(numbered.id), positions)
     mean = np.concatenate([poses[-1], positions.ravel()])
-    return poses, belief._replace(mean=jnp.asarray(mean, belief.mean.dtype)), closures
+    return poses, belief._replace(mean=on_device(mean)), closures
 
 
 def _close_loops(
@@ -187,5 +186,6 @@ def _positions_of(belief: Belief, ids: np.ndarray, smoothed_positions: np.ndarra
     """
     ids = np.where(ids < 0, np.iinfo(ids.dtype).max, ids)  # sorts last, and is no landmark's id
     index = np.searchsorted(ids, belief.id)
+    positions = np.asarray(belief.mean)[3:].reshape(-1, 2)
     is_smoothed = (np.asarray(belief.num_seen) > 0) & (ids[index] == np.asarray(belief.id))
-    return np.where(is_smoothed[:, None], smoothed_positions[index], belief.landmark_positions)
+    return np.where(is_smoothed[:, None], smoothed_positions[index], positions)

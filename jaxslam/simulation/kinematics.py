@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.batching import on_device
 from jaxslam.core.calibration import along_arc
 from jaxslam.core.se2 import compose, range_bearing, relative, rotation
 from jaxslam.core.types import Array
@@ -211,7 +212,7 @@ def noise_params(
     if world is None:
         return params
     std = np.hypot(float(params.wall_angle_std), direction_std(world.walls))
-    return params._replace(wall_angle_std=jnp.asarray(std, float))
+    return params._replace(wall_angle_std=on_device(std))
 
 
 def _drive_noise(robot: Robot) -> NoiseParams:

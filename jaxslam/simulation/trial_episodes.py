@@ -5,7 +5,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
@@ -222,6 +221,7 @@ def episode_of(
     return episode, scans
 
 
+@jax.jit
 def trial_keys(key: Key, trials: Array) -> Key:
     """Keys (B,) of the trials with numbers (B,): each can be repeated without the others."""
     return jax.vmap(partial(jax.random.fold_in, key))(trials)
@@ -263,7 +263,7 @@ def simulate_episodes(
         ValueError: An argument is not possible; the message says what is expected.
     """
     given = drive_of(key, config, robot, world, path, num_scans, life, match_scans)
-    keys = trial_keys(key, jnp.arange(as_count("num_trials", num_trials)))
+    keys = trial_keys(key, np.arange(as_count("num_trials", num_trials)))
     return simulate_drives(
         keys,
         config.frontend,

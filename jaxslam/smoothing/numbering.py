@@ -6,9 +6,11 @@ problem needs indices 0..L-1, and a first estimate of each position.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.core.batching import on_device
 from jaxslam.core.features import Features
 from jaxslam.core.se2_np import transform
 from jaxslam.core.types import WALL, AnyArray, Array, as_float64, check_array
@@ -70,9 +72,9 @@ def number_landmarks(
     positions = _mean_positions(index, np.asarray(poses), features, capacity)
     padded = np.pad(kept_ids, (0, capacity - len(kept_ids)), constant_values=-1)
     return NumberedLandmarks(
-        landmark_index=jnp.asarray(index, jnp.int32),
-        positions=jnp.asarray(positions),
-        id=jnp.asarray(padded, jnp.int32),
+        landmark_index=on_device(index.astype(np.int32)),
+        positions=jax.device_put(positions),
+        id=on_device(padded.astype(np.int32)),
     )
 
 

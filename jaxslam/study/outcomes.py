@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxslam.core.types import Metrics
@@ -45,15 +46,19 @@ class Outcomes(NamedTuple):
     landmarks: np.ndarray
 
 
+# One program each instead of forty of one operation.
+_pose_error, _nees = jax.jit(consistency.pose_error), jax.jit(consistency.nees)
+
+
 def outcomes_of(result: TrialResult) -> Outcomes:
     """Outcomes of some trials, whose scans are all there and whose truth is known."""
     truth, cov = np.asarray(result.truth), np.asarray(result.cov)
     with np.errstate(invalid="ignore"):
-        gap = np.asarray(consistency.pose_error(result.estimate, result.truth), np.float64)
+        gap = np.asarray(_pose_error(result.estimate, result.truth), np.float64)
     error = np.hypot(gap[..., 0], gap[..., 1])
     error = np.where(np.isfinite(error), error, np.inf)
     turn = np.where(np.isfinite(gap[..., 2]), gap[..., 2], np.pi)
-    value = np.asarray(consistency.nees(gap, cov), np.float64)
+    value = np.asarray(_nees(gap, cov), np.float64)
     usable = np.isfinite(value) & (np.trace(cov, axis1=-2, axis2=-1) >= CERTAIN_TRACE)
     count = usable.sum(axis=1)
     total = consistency.nees_per_dof(np.where(usable, value, 0.0).sum(axis=1))

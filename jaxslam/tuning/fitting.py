@@ -16,12 +16,11 @@ from functools import cache, partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
-from jaxslam.core.batching import BatchSize
+from jaxslam.core.batching import BatchSize, on_device
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.types import Array, as_count
 from jaxslam.pipeline.config import Config
@@ -304,10 +303,8 @@ def _update_theta(
     state: TuneState, optimizer: Any, value: float, gradient: np.ndarray, trainable: np.ndarray
 ) -> TuneState:
     """Update the trainable parameters (P,) bool by the optimiser."""
-    theta = jnp.asarray(state.theta[trainable])
-    slope = jnp.asarray(gradient[trainable], theta.dtype)
+    theta, slope, loss = on_device((state.theta[trainable], gradient[trainable], value))
     with jax.numpy_dtype_promotion("standard"):  # optax needs it
-        loss = jnp.asarray(value, theta.dtype)
         change, inner = _optimizer_update(optimizer, slope, state.optimizer_state, theta, loss)
     updated = state.theta.copy()
     updated[trainable] += np.asarray(change, np.float64)

@@ -119,6 +119,7 @@ def lbfgs_backtracking() -> optax.GradientTransformationExtraArgs:
     """
     lbfgs = optax.scale_by_lbfgs(memory_size=LBFGS_MEMORY)
 
+    @jax.jit  # one program instead of six
     def init(theta: Array) -> BacktrackState:
         reach = jnp.full((), MAX_CHANGE, theta.dtype)
         value = jnp.full((), jnp.inf, theta.dtype)

@@ -4,10 +4,10 @@ from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxslam.core.batching import on_device
 from jaxslam.core.types import check_type
 from jaxslam.tuning import parameters
 
@@ -75,7 +75,7 @@ def init(
     return TuneState(
         step=np.int64(0),
         theta=theta,
-        optimizer_state=optimizer.init(jnp.asarray(theta[trainable])),
+        optimizer_state=optimizer.init(on_device(theta[trainable])),
         theta_history=np.full((num_updates + 1, theta.size), np.nan),
         loss=not_yet,
         heldout=not_yet,
@@ -145,7 +145,7 @@ def result(
         best=best,
         loss=state.loss[:count],
         heldout=state.heldout[:count],
-        history=jax.tree.map(lambda *x: jnp.stack(x), *history),
+        history=jax.tree.map(lambda *x: jax.device_put(np.stack(x)), *history),
         skipped=state.skipped[:count],
     )
 

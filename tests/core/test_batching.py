@@ -135,3 +135,27 @@ def test_arrays_on_the_device_have_its_precision_and_keep_their_kind():
     found = on_device(given)
     assert found["real"].dtype == jnp.zeros(()).dtype and found["whole"].dtype == jnp.int32
     assert found["flag"].dtype == jnp.bool_ and isinstance(found["whole"], jax.Array)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_arrays_come_to_the_device_without_a_program(wide):
+    """Shapes and types that no other test has; `jnp.asarray` compiles one for each."""
+    given = [np.full((3, 17, wide + 2), 0.1, kind) for kind in (np.float16, np.float32, float)]
+    given += [np.zeros((19, 3, wide + 1), kind) for kind in (bool, np.int32, np.int64)]
+    programs = []
+
+    def listen(event, *_, **__):
+        if "backend_compile" in event:
+            programs.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        with jax.enable_x64(wide):
+            found = on_device(given)
+            assert not programs
+            wanted = [jnp.asarray(x, float if x.dtype.kind == "f" else None) for x in given]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    for one, other in zip(found, wanted, strict=True):
+        assert one.dtype == other.dtype and not one.weak_type
+        np.testing.assert_array_equal(one, other)

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli import map_files
+from jaxslam.core.batching import on_device
 from jaxslam.core.maps import TopologicalMap
 from jaxslam.core.measurement import Measurement
 from jaxslam.core.regions import PlannerData, Regions
@@ -244,8 +244,8 @@ def draw_localisation(path: Path, saved_map: SavedMap, infos: LocaliseInfo) -> N
     """Draw the poses of a log, by their probability, over the walls of a map."""
     from jaxslam.viz import canvas, maps  # imported here, because matplotlib is slow to import
 
-    scans = saved_map.scans._replace(ranges=jnp.asarray(saved_map.scans.ranges, float))
-    points = jax.vmap(lidar.beam_ends, in_axes=(None, 0))(saved_map.lidar, scans)
+    scans = saved_map.scans._replace(ranges=on_device(saved_map.scans.ranges))
+    points = _beam_ends(saved_map.lidar, scans)
     figure, axis = canvas.map_canvas(*canvas.extent(saved_map.poses))
     maps.draw_hits(axis, saved_map.poses, np.asarray(points), np.asarray(scans.hit))
     maps.draw_probable_poses(axis, infos.pose, infos.probability)

@@ -10,6 +10,8 @@ does not show has the score `nowhere_score`. What is remembered is thus the evid
 1 / (1 - memory) windows, so a robot that was carried is found again within a few metres.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -27,6 +29,7 @@ ENOUGH_POINTS = 30.0
 """Points of a scan from which on it is full evidence."""
 
 
+@partial(jax.jit, static_argnums=0)
 def no_hypotheses(count: int) -> Hypotheses:
     """H hypotheses that do not exist."""
     cov = jnp.broadcast_to(jnp.eye(3), (count, 3, 3))

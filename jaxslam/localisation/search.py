@@ -43,6 +43,7 @@ class Found(NamedTuple):
     nowhere: Array
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def empty_window(spec: LocaliseSpec, lidar: Lidar) -> Window:
     """A window without scans."""
     size = spec.window_scans - 1

@@ -14,11 +14,10 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxslam.core.batching import pad_to
+from jaxslam.core.batching import on_device, pad_to
 from jaxslam.core.scan import Lidar, Scan, check_lidar
 from jaxslam.core.types import AnyArray, Array, as_float64
 from jaxslam.matching import checks
@@ -135,7 +134,7 @@ def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> 
         raise ValueError("poses are those of no keyframe, or not finite")
     # The last keyframe again changes nothing, and few numbers of keyframes are compiled.
     padded = pad_to((poses, scans), to=len(poses) + -len(poses) % KEYFRAME_BLOCK)
-    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, jnp.asarray(padded[0], float), padded[1]))
+    surfaces = jax.tree.map(np.asarray, _surfaces(lidar, on_device(padded[0]), padded[1]))
     seen = surfaces.valid
     points, normals = (x[seen].astype(float) for x in (surfaces.points, surfaces.normal))
     everything = np.concatenate([points, poses[:, :2]])
@@ -146,15 +145,15 @@ def build_index(spec: PlaceSpec, lidar: Lidar, poses: AnyArray, scans: Scan) -> 
     padding = -len(positions) % POSITION_BLOCK
     valid = np.arange(len(positions) + padding) < len(positions)
     positions = pad_to(positions, to=len(valid))
-    table = jnp.asarray(distance, float)
+    table = on_device(distance)
     return PlaceIndex(
-        origin=jnp.asarray(low, float),
+        origin=on_device(low),
         distance=table,
-        normal=jnp.asarray(normal, float),
-        offset=jnp.asarray(offset, float),
-        positions=jnp.asarray(positions, float),
-        views=views_of_map(spec.cell, table, jnp.asarray(positions - low, float)),
-        valid=jnp.asarray(valid),
+        normal=on_device(normal),
+        offset=on_device(offset),
+        positions=on_device(positions),
+        views=views_of_map(spec.cell, table, on_device(positions - low)),
+        valid=on_device(valid),
     )
 
 

@@ -59,12 +59,17 @@ def empty_submap(spec: ScanMatchSpec, lidar: Lidar) -> Submap:
     """
     checks.check_scan_match_spec(spec)
     check_lidar(lidar)
-    size = spec.window_scans, lidar.num_beams
+    return _no_keyframes(spec.window_scans, lidar.num_beams)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _no_keyframes(window_scans: int, num_beams: int) -> Submap:
+    size = window_scans, num_beams
     nothing = OrientedPoints(
         jnp.zeros((*size, 2)), jnp.zeros((*size, 2)), jnp.zeros(size), jnp.zeros(size, bool)
     )
     return Submap(
-        nothing, jnp.zeros((spec.window_scans, 3)), jnp.int32(0), jnp.zeros(3), first_history()
+        nothing, jnp.zeros((window_scans, 3)), jnp.int32(0), jnp.zeros(3), first_history()
     )
 
 

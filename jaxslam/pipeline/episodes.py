@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core import se2_np
-from jaxslam.core.batching import BatchSize, map_batches
+from jaxslam.core.batching import BatchSize, map_batches, on_device
 from jaxslam.core.devices import DeviceMap
 from jaxslam.core.episode import Episode, measurements_of
 from jaxslam.core.features import Features
@@ -27,7 +27,6 @@ from jaxslam.filtering.slam_filter import StepInfo
 from jaxslam.frontend import extract
 from jaxslam.frontend.config import FrontendConfig
 from jaxslam.frontend.features import features_from_range_bearing
-from jaxslam.frontend.lidar import to_scan
 from jaxslam.pipeline import arguments, online
 from jaxslam.pipeline.config import Config
 from jaxslam.pipeline.stacking import as_episodes, numpy_episode
@@ -230,7 +229,7 @@ def episode_from_laser_log(
             raise ValueError("the reference has no pose at the time of a scan")
         truth[i], truth_mask[i], begin = poses[j], True, int(i.min())
     increments = se2_np.increments(odometry[begin:])
-    scans = to_scan(config.frontend.lidar, jnp.asarray(ranges[begin:], float))
+    scans = arguments.scans_of_log(config.frontend.lidar, on_device(ranges[begin:]))
     guessed = laser_log.odometry_guessed
     guessed = None if guessed is None else guessed[begin:]
     matched = (

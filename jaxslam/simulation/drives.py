@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxslam.core import se2_np
+from jaxslam.core import se2_np, trace_cache
 from jaxslam.core.scan import Lidar, Scan
 from jaxslam.core.se2 import compose
 from jaxslam.core.types import Array, Key
@@ -123,6 +123,9 @@ def drive_as_drawn(
     return poses, kinematics.report_odometry(robot, jnp.pad(odometry, ((1, 0), (0, 0))))
 
 
+_drive = trace_cache.jit(drive, static_argnames=("robot", "num_scans"), compile_quickly=True)
+
+
 def num_scans_of_drive(robot: Robot, path: Any, world: World | None = None) -> int:
     """Number of scans on a noise-free drive to the end of a path (N, 2).
 
@@ -144,8 +147,7 @@ def num_scans_of_drive(robot: Robot, path: Any, world: World | None = None) -> i
     robot = robot._replace(encoder_noise=0.0, steering_noise=0.0, slip_noise=still)
     robot = robot._replace(odometry_rate=0.0)
     upper_bound = 40 + int(4 * _least_motions(robot, np.asarray(points)))
-    simulated = jax.jit(partial(drive, num_scans=upper_bound), static_argnums=1)
-    poses, odometry = simulated(jax.random.key(0), robot, points)
+    poses, odometry = _drive(jax.random.key(0), robot=robot, path=points, num_scans=upper_bound)
     moving = np.abs(np.asarray(odometry)[1:]).sum(axis=1) > 0
     if moving.all():
         raise ValueError(

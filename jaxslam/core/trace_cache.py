@@ -31,9 +31,8 @@ A file is
     bytes 32-    serialised `jax.export.Exported`: StableHLO, platform, trees and shapes of the
                  arguments and the results
 
-A damaged file fails its checksum and is written again. A file that cannot be written is skipped:
-the process then uses what it has traced. A change of the package's sources gives all of them new
-names; `cache_limit` removes files that have not been used for long.
+A damaged file fails its checksum and is written again. A file that cannot be written is skipped. A
+change of the package's sources gives all of them new names; `cache_limit` removes old ones.
 
 Why arguments are committed to a device: JAX compiles a program once for committed arrays (bound to
 a device by `jax.device_put`) and once more for uncommitted ones (all others). Results of an
@@ -52,7 +51,7 @@ from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -108,10 +107,13 @@ class _Key(NamedTuple):
     avals: tuple[jax.ShapeDtypeStruct, ...]
 
 
+Quickly = bool | Literal["unoptimised"]
+
+
 class CachedJit:
     """A jitted function with a persistent trace; made by `jit`."""
 
-    def __init__(self, function: Callable, static: tuple[str, ...], quickly: bool = False):
+    def __init__(self, function: Callable, static: tuple[str, ...], quickly: Quickly = False):
         """Wrap a function, whose arguments with names in `static` are static."""
         self._function = function
         self._static = static
@@ -158,7 +160,7 @@ class CachedJit:
     @property
     def _options(self) -> dict[str, Any] | None:
         """Options of XLA; None if there are none."""
-        return (quick_options() if self._quickly else None) or None
+        return (quick_options(self._quickly is True) if self._quickly else None) or None
 
     def _find(self, args: tuple, kwargs: dict) -> tuple[jax.stages.Wrapped, tuple, dict]:
         """Program for such arguments, jitted by JAX, and the arguments to call it with."""
@@ -220,7 +222,7 @@ def jit(
     function: Callable,
     *,
     static_argnames: str | tuple[str, ...] = (),
-    compile_quickly: bool = False,
+    compile_quickly: Quickly = False,
 ) -> CachedJit:
     """`jax.jit` with a trace that outlives the process; see the module's docstring.
 
@@ -233,7 +235,7 @@ def jit(
             package's sources.
         static_argnames: Names of its static arguments.
         compile_quickly: Whether to compile with `quick_options`, which within other programs are
-            those of these.
+            those of these; "unoptimised" is for programs that run a few times.
     """
     names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     return CachedJit(function, tuple(names), compile_quickly)

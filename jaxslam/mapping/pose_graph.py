@@ -55,7 +55,7 @@ class PoseGraph(NamedTuple):
     closure_information: np.ndarray = np.zeros((0, 3, 3))
 
 
-@partial(trace_cache.jit, static_argnames="config", compile_quickly=True)
+@partial(trace_cache.jit, static_argnames="config", compile_quickly="unoptimised")
 def _noise_model(
     config: FilterConfig, params: NoiseParams, measurements: Measurement
 ) -> tuple[Array, Array, Array]:

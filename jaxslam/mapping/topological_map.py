@@ -36,7 +36,7 @@ from jaxslam.mapping.polyline_transport import attach_polyline
 # An arc passes through a node if it is closer than this fraction of the node's clearance.
 PASS_CLEARANCE = 0.5
 
-_attach = trace_cache.jit(attach_polyline)
+_attach = trace_cache.jit(attach_polyline, compile_quickly="unoptimised")
 
 
 def build_map(

@@ -73,7 +73,9 @@ def init(config: Config, start: Any = None, *, match_scans: bool = True) -> Slam
     )
 
 
-@partial(trace_cache.jit, static_argnames=("config", "lidar", "spec"))
+@partial(
+    trace_cache.jit, static_argnames=("config", "lidar", "spec"), compile_quickly="unoptimised"
+)
 def _init(
     config: FilterConfig, lidar: Lidar, spec: ScanMatchSpec | None, start: Array
 ) -> SlamState:

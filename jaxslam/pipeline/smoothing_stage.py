@@ -28,7 +28,7 @@ PADDING_MULTIPLE = 512
 _build_problem = trace_cache.jit(
     smoothing_problem.build_problem,
     static_argnames=("untrusted_inflation", "noise_model"),
-    compile_quickly=True,
+    compile_quickly="unoptimised",
 )
 
 

@@ -123,7 +123,9 @@ def drive_as_drawn(
     return poses, kinematics.report_odometry(robot, jnp.pad(odometry, ((1, 0), (0, 0))))
 
 
-_drive = trace_cache.jit(drive, static_argnames=("robot", "num_scans"), compile_quickly=True)
+_drive = trace_cache.jit(
+    drive, static_argnames=("robot", "num_scans"), compile_quickly="unoptimised"
+)
 
 
 def num_scans_of_drive(robot: Robot, path: Any, world: World | None = None) -> int:

@@ -65,8 +65,10 @@ Blocks = tuple[np.ndarray, np.ndarray, AnyArray]
 Rows = tuple[Jacobian, LoopClosureRows | None]
 """Reweighted Jacobian, NumPy, and that of the loop closures if there are any."""
 
-_whitened = trace_cache.jit(whitened, static_argnames="num_landmarks", compile_quickly=True)
-_wrapped = trace_cache.jit(wrap_state)
+_whitened = trace_cache.jit(
+    whitened, static_argnames="num_landmarks", compile_quickly="unoptimised"
+)
+_wrapped = trace_cache.jit(wrap_state, compile_quickly="unoptimised")
 
 
 def smooth_log(
@@ -148,7 +150,7 @@ def smooth_log(
     return SmoothingResult(*state, np.array(costs))
 
 
-@partial(trace_cache.jit, compile_quickly=True)
+@partial(trace_cache.jit, compile_quickly="unoptimised")
 def _evaluate(
     scale: Array, problem: WhitenedProblem, state: arrowhead.State
 ) -> tuple[Array, arrowhead.State, Jacobian]:

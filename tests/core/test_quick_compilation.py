@@ -6,6 +6,9 @@ import pytest
 from jaxslam.core import quick_compilation, trace_cache
 from jaxslam.core.quick_compilation import quick_options
 
+KNOWN = {"xla_cpu_enable_fast_min_max": False}
+"""An option that the flags of the tests do not name, as options that they do are left out."""
+
 
 @pytest.fixture(autouse=True)
 def options_anew():
@@ -33,8 +36,7 @@ def constant():
 
 
 def test_a_quickly_compiled_function_is_part_of_other_programs(monkeypatch):
-    # An option that the flags of the tests do not name, as options that they do are left out.
-    monkeypatch.setattr(quick_compilation, "QUICK", {"xla_cpu_enable_fast_min_max": False})
+    monkeypatch.setattr(quick_compilation, "QUICK", KNOWN)
     assert quick_options()
     quick, quick_constant = (trace_cache.jit(f, compile_quickly=True) for f in (wave, constant))
     x = jnp.linspace(0.0, 3.0, 6)
@@ -47,3 +49,21 @@ def test_a_quickly_compiled_function_is_part_of_other_programs(monkeypatch):
         lambda f: jax.vmap(lambda y: f()[0] + y)(x),
     ):
         np.testing.assert_allclose(call(quick_constant), call(constant), rtol=1e-14)
+
+
+@pytest.mark.parametrize("quickly", [True, "unoptimised"])
+def test_each_kind_of_program_has_the_options_of_its_kind(monkeypatch, quickly):
+    own, other = ("QUICK", "UNOPTIMISED")[:: 1 if quickly is True else -1]
+    monkeypatch.setattr(quick_compilation, own, KNOWN)
+    monkeypatch.setattr(quick_compilation, other, {"xla_cpu_no_such_option": False})
+    given, real = [], jax.jit
+
+    def jit(function, **options):
+        given.append(options.get("compiler_options"))
+        return real(function, **options)
+
+    monkeypatch.setattr(jax, "jit", jit)
+    x = jnp.linspace(0.0, 3.0, 7)
+    found = trace_cache.jit(wave, compile_quickly=quickly)(x)
+    np.testing.assert_allclose(found, wave(x), rtol=1e-14)
+    assert KNOWN in given

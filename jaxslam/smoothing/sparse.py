@@ -150,7 +150,7 @@ def smooth_log(
     return SmoothingResult(*state, np.array(costs))
 
 
-@partial(trace_cache.jit, compile_quickly="unoptimised")
+@partial(trace_cache.jit, compile_quickly=True)  # it runs at every step
 def _evaluate(
     scale: Array, problem: WhitenedProblem, state: arrowhead.State
 ) -> tuple[Array, arrowhead.State, Jacobian]:

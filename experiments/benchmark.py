@@ -31,7 +31,7 @@ from experiments import (
     peer_matching,
     roofline,
 )
-from experiments.timing import fastest, pin, seconds
+from experiments.timing import as_long_work, fastest, pin, seconds
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
 from jaxslam.core.features import Features
@@ -67,6 +67,7 @@ def batched(function: Callable) -> Callable:
     return jax.jit(call)
 
 
+@as_long_work()
 def chain(seed: int, num_trials: int, repeats: int) -> tuple[common.Numbers, Scan]:
     """Scans per second of the whole chain, milliseconds per scan of its parts; and its scans."""
     config = Config()

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import common
-from experiments.timing import fastest
+from experiments.timing import as_long_work, fastest
 from jaxslam.core import polylines
 from jaxslam.core.batching import map_batches
 from jaxslam.core.episode import Episode
@@ -37,6 +37,7 @@ TRAFFIC = Traffic(people=10)
 WHEELS = WheelFaults(slip=0.02, carpet=0.2, lost=0.002, dropped=0.02)
 
 
+@as_long_work()
 def compute(seed: int, num_trials: int, repeats: int) -> common.Numbers:
     """Scans per second of the chain plain and in life, and of ray casting with many walls.
 

@@ -3,11 +3,14 @@
 import gc
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
+
+from jaxslam.core import quick_compilation
 
 THREADS = Path("/proc/self/task")
 
@@ -27,6 +30,16 @@ def _set_affinity(cores: set[int]) -> None:
     if hasattr(os, "sched_setaffinity") and THREADS.is_dir():
         for thread in THREADS.iterdir():
             os.sched_setaffinity(int(thread.name), cores)
+
+
+@contextmanager
+def as_long_work() -> Iterator[None]:
+    """Compile for speed whatever is called here, though it is short (`quick_compilation`)."""
+    kept, quick_compilation.SHORT_WORK = quick_compilation.SHORT_WORK, 0
+    try:
+        yield
+    finally:
+        quick_compilation.SHORT_WORK = kept
 
 
 def seconds(function: Callable, *arguments: Any) -> float:

@@ -11,12 +11,14 @@ from experiments import (
     benchmark,
     common,
     filter_benchmark,
+    life_benchmark,
     peer_automata,
     peer_filters,
     start,
     workload,
 )
 from jaxslam.core.measurement import Measurement
+from jaxslam.core.quick_compilation import is_short
 from jaxslam.core.scan import Scan
 from jaxslam.filtering import slam_filter
 from jaxslam.filtering.config import FilterConfig, init
@@ -171,3 +173,18 @@ def test_the_log_that_is_started_with_is_the_office_drive(tmp_path):
     assert log.ranges.shape == (steps, Config().frontend.lidar.num_beams)
     assert np.isfinite(log.ranges).mean() > 0.9 and log.num_skipped == 0
     assert 70.0 < np.hypot(*np.diff(log.odom_poses[:, :2], axis=0).T).sum() < 90.0
+
+
+def test_drives_that_are_timed_are_compiled_as_for_long_work(monkeypatch):
+    """Few are else compiled quickly, and run slower than many do."""
+    seen = []
+
+    def drive_in():
+        seen.append(is_short(1))
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(common, "drive_in", drive_in)
+    for measured in (benchmark.chain, life_benchmark.compute):
+        with pytest.raises(RuntimeError, match="enough"):
+            measured(0, 1, 1)
+    assert seen == [False, False] and is_short(1)

@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.cli.options import name_errors
@@ -113,7 +112,7 @@ def read_building(
             )
         walls = World(on_device(building.world.walls))
         notes += [f"{drive} of {found.length:.0f} m, {len(found.stops)} stops", *found.notes]
-        driven = jnp.asarray(found.path, float)
+        driven = on_device(found.path)
         return Building(walls, driven, tuple(notes), world, building.occupancy)
     elif points is None:
         advice = "add --drive patrol, or --path FILE, CSV of x,y [m] or GeoJSON of one LineString"
